@@ -21,7 +21,7 @@ from numpy.typing import NDArray
 
 import wiw
 from wiw import scenes
-from wiw.analysis.intervals import clustered_t
+from wiw.analysis.intervals import clustered_interval
 from wiw.reproject import pose, warp
 from wiw.training.pocket.held_out import BASELINES, STEPS, Imagine, Window, draw_windows, imagine_by, measure
 from wiw.world_models.warpnet.model import turn_panorama
@@ -79,7 +79,7 @@ def print_gap(rows: Sequence[Mapping[str, Any]], size: str) -> None:
             if row["model"] == model and row["kind"] == "mixed":
                 found[row["scene"], row["window"], row["step"]][row["control"]] = row[size]
         gaps = [pair["true"] - pair["shuffled"] for pair in found.values()]
-        low, high = clustered_t(gaps, [scene for scene, _, _ in found], "length")
+        low, high = clustered_interval(gaps, [scene for scene, _, _ in found], "length")
         print(f"  {model:<18}{np.mean(gaps):6.2f} [{low:.2f}, {high:.2f}]")
 
 

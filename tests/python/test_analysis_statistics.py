@@ -10,10 +10,23 @@ from hypothesis import strategies as st
 from rich.console import Console
 from scipy import stats
 
-from wiw.analysis.intervals import agresti_min, clustered_bootstrap, clustered_t, student, wilson
-from wiw.analysis.statistics import compare, estimate_difference, estimate_mean, holm, mcnemar
+from wiw.analysis.flip_test import DRAWS, approximate_flips, find_p_value, flip_signs
+from wiw.analysis.intervals import (
+    clustered_bootstrap,
+    clustered_interval,
+    count_effective,
+    design_effect,
+    interval_of_sums,
+    jackknife_covariance,
+    p_value_of_sums,
+    sum_by_cluster,
+    tango,
+    wilson,
+)
+from wiw.analysis.statistics import compare, estimate_difference, estimate_mean, holm
 from wiw.analysis.summary import load_metrics, notes, show_estimate, summarise
 from wiw.errors import ArgumentError
+from wiw.report.page import sentence, summary_html
 from wiw.report.tables import SummaryTable
 
 SR, SPL, TRAJ = (next(each for each in load_metrics() if each.name == name) for name in ("success", "spl", "actions"))
@@ -23,13 +36,6 @@ SR, SPL, TRAJ = (next(each for each in load_metrics() if each.name == name) for 
 def test_wilson_is_scipys(successes, n):
     expected = stats.binomtest(successes, n).proportion_ci(method="wilson")
     assert wilson(successes / n, n) == pytest.approx((expected.low, expected.high), abs=1e-12)
-
-
-def test_student_is_scipys():
-    data = np.random.default_rng(0).normal(40, 9, 23)
-    expected = stats.ttest_1samp(data, 0).confidence_interval()
-    assert student(data) == pytest.approx((expected.low, expected.high))
-    assert all(math.isnan(end) for end in student([3.0]))
 
 
 @pytest.mark.parametrize("method", ["bca", "percentile"])
@@ -69,29 +75,91 @@ def test_bootstrap_is_keyed_by_its_seed_and_refuses_nonsense():
         clustered_bootstrap(data, scenes, method="magic")
 
 
-def test_mcnemar_is_statsmodels():
+def test_flips_of_single_episodes_are_mcnemars_test():
     tables = pytest.importorskip("statsmodels.stats.contingency_tables")
     rng = np.random.default_rng(3)
     arm, base = (rng.random(50) < 0.6).astype(float), (rng.random(50) < 0.3).astype(float)
     table = [[((arm == a) & (base == b)).sum() for b in (0, 1)] for a in (0, 1)]
-    assert mcnemar(arm, base) == pytest.approx(tables.mcnemar(table, exact=True).pvalue)
-    assert mcnemar([1, 0], [1, 0]) == 1.0
+    assert flip_signs(arm - base) == pytest.approx(tables.mcnemar(table, exact=True).pvalue)
+    assert flip_signs(np.zeros(2)) == 1.0
 
 
-def test_agresti_min_formula_by_hand():
-    differences = [1.0] * 5 + [-1.0] * 2 + [0.0] * 13
-    b, c, n = 5.5, 2.5, 22
-    half = 1.959964 * math.sqrt((b + c) - (b - c) ** 2 / n) / n
-    assert agresti_min(differences) == pytest.approx(((b - c) / n - half, (b - c) / n + half), abs=1e-6)
+@settings(max_examples=60, deadline=None)
+@given(st.lists(st.integers(-4, 4), min_size=8, max_size=9), st.floats(0.1, 3.0))
+def test_flips_of_scenes_are_scipys_permutations(sums, scale):
+    """Whole numbers are convolved, others enumerated; scipy tries all flips by itself."""
+    found = stats.permutation_test(
+        (np.asarray(sums, float),),
+        lambda x, axis: np.abs(x.sum(axis)),
+        permutation_type="samples",
+        alternative="greater",
+    )
+    assert flip_signs(np.asarray(sums, float)) == pytest.approx(found.pvalue)
+    assert flip_signs(scale * np.asarray(sums, float)) == pytest.approx(found.pvalue)
 
 
-def test_agresti_min_covers():
+def test_many_flips_are_drawn_by_the_seed():
+    sums = np.random.default_rng(4).normal(0.3, 1, 40)
+    p_value = flip_signs(sums, seed=1)
+    assert p_value == flip_signs(sums, seed=1) and p_value >= 1 / (DRAWS + 1)
+    expected = 2 * stats.norm.sf(abs(sums.sum()) / np.sqrt(np.square(sums).sum()))
+    assert p_value == pytest.approx(expected, abs=0.02)
+
+
+def test_approximate_flips_are_near_the_exact_ones():
+    sums = np.random.default_rng(5).integers(-3, 4, (400, 20)).astype(float)
+    exact = np.array([flip_signs(one) for one in sums])
+    assert np.abs(approximate_flips(sums) - exact).max() < 0.06
+    assert np.mean((approximate_flips(sums) <= 0.05) != (exact <= 0.05)) < 0.02
+
+
+def test_which_test_is_used():
+    """Whole scenes from 8 on, the interval's below, episodes of a single one."""
+    won = np.array([1.0, 0.0, 1.0, 0.0] * 8)
+    scenes = np.repeat(np.arange(8), 4)
+    assert find_p_value(won, list(scenes), "difference") == pytest.approx(2 / 2**8)
+    assert find_p_value(won, ["house"] * 32, "difference") == pytest.approx(2 / 2**16)
+    few = find_p_value(won[:12], list(scenes[:12]), "difference")
+    assert few == pytest.approx(
+        float(p_value_of_sums(*(np.array(x) for x in ([2.0] * 3, 6.0, [4.0] * 3)), "difference"))  # type: ignore[arg-type]
+    )
+
+
+@pytest.mark.parametrize("kind", ["difference", "length"])
+def test_p_is_where_the_interval_ends_at_zero(kind):
+    rng = np.random.default_rng(6)
+    sums, counts = rng.integers(-1, 4, 6).astype(float), np.array([4.0, 5, 5, 6, 5, 4])
+    squares, span = float(np.abs(sums).sum()) + 4, 1.5
+    p_value = float(p_value_of_sums(sums, squares, counts, kind, span))
+    low, high = interval_of_sums(sums, squares, counts, kind, 1 - p_value, span)
+    assert min(abs(low), abs(high)) < 1e-6 and 0 < p_value < 1
+
+
+def test_tango_by_its_score_equation():
+    """At either end the score statistic, with the share lost that fits best there, is the normal quantile."""
+    wins, losses, n = 9, 2, 40
+    differences = [1.0] * wins + [-1.0] * losses + [0.0] * (n - wins - losses)
+    for gap in tango(differences):
+        shares = np.linspace(max(0, -gap), (1 - gap) / 2, 200_001)[1:-1]
+        likelihood = wins * np.log(shares + gap) + losses * np.log(shares)
+        likelihood += (n - wins - losses) * np.log(1 - 2 * shares - gap)
+        lost = shares[likelihood.argmax()]
+        score = (wins - losses - n * gap) / math.sqrt(n * (2 * lost + gap - gap**2))
+        assert abs(score) == pytest.approx(1.959964, abs=1e-3)
+
+
+def test_tango_where_no_episode_differs():
+    z = 1.959964
+    assert tango(np.zeros(25)) == pytest.approx((-z * z / (25 + z * z), z * z / (25 + z * z)), abs=1e-6)
+
+
+def test_tango_covers():
     """Exact coverage over all outcomes of 20 pairs, with 25 % wins and 10 % losses."""
     n, win, loss = 20, 0.25, 0.10
     covered = 0.0
     for wins in range(n + 1):
         for losses in range(n + 1 - wins):
-            low, high = agresti_min([1.0] * wins + [-1.0] * losses + [0.0] * (n - wins - losses))
+            low, high = tango([1.0] * wins + [-1.0] * losses + [0.0] * (n - wins - losses))
             if low <= win - loss <= high:
                 covered += stats.multinomial.pmf([wins, losses, n - wins - losses], n, [win, loss, 1 - win - loss])
     assert 0.94 < covered < 0.985
@@ -174,8 +242,8 @@ def test_differences_are_paired_by_episode_and_signed_towards_the_better():
         "b": {i: outcome("b", i, 0.0) for i in (1, 2, 3)},
     }
     rate, length = compare("a", "b", done, SR), compare("a", "b", done, TRAJ)
-    assert (rate.estimate.n, rate.wins, rate.estimate.value, rate.p_value) == (2, 2, 100.0, 0.5)
-    assert (length.estimate.value, length.wins, length.p_value) == (-10.0, 2, None)
+    assert (rate.estimate.n, rate.wins, rate.estimate.value) == (2, 2, 100.0) and 0.2 < rate.p_value < 1
+    assert (length.estimate.value, length.wins) == (-10.0, 2) and 0.2 < length.p_value < 1
     assert compare("a", "b", {"a": {0: done["a"][0]}, "b": {3: done["b"][3]}}, SR) is None
 
 
@@ -211,32 +279,55 @@ def test_arms_say_what_they_are():
     assert roles == ["policy without a world model", "another policy without a world model", "world model"]
 
 
-def test_t_over_scenes_is_the_cluster_robust_interval_of_statsmodels():
+def test_variance_over_scenes_is_the_cluster_robust_one_of_statsmodels():
     sm = pytest.importorskip("statsmodels.api")
     rng = np.random.default_rng(5)
     scenes = np.repeat(np.arange(12), 4)
     data = rng.normal(0, 1, 12)[scenes] + rng.normal(0, 1, 48)
     fit = sm.OLS(data, np.ones(48)).fit(cov_type="cluster", cov_kwds={"groups": scenes})
-    half = stats.t.ppf(0.975, 11) * fit.bse[0]
-    assert clustered_t(data, scenes, "length") == pytest.approx((data.mean() - half, data.mean() + half))
+    sums, counts = sum_by_cluster(data, scenes)
+    assert jackknife_covariance(sums, sums, counts) == pytest.approx(fit.bse[0] ** 2)
 
 
-def test_t_over_scenes_is_students_where_every_episode_is_its_own_scene():
+def test_lengths_over_scenes_are_students_but_for_the_made_up_episodes():
     data = np.random.default_rng(6).normal(40, 9, 23)
-    assert clustered_t(data, np.arange(23), "length") == pytest.approx(student(data))
+    expected = stats.ttest_1samp(data, 0).confidence_interval()
+    assert clustered_interval(data, np.arange(23), "length", span=0.0) == pytest.approx((40, 40), abs=10)
+    many = clustered_interval(np.tile(data, 200), np.tile(np.arange(23), 200), "length")
+    assert many == pytest.approx((expected.low, expected.high), abs=0.3)
 
 
-def test_made_up_episodes_by_hand():
-    scenes, t = np.repeat(np.arange(5), 4), stats.t.ppf(0.975, 4)
-    more = 2 * (stats.norm.ppf(0.975) / t) ** 2
-    n, q = 20 + more, more / 2 / (20 + more)
-    assert clustered_t(np.zeros(20), scenes, "rate") == pytest.approx((0.0, q + t * math.sqrt(q * (1 - q) / n)))
-    assert clustered_t(np.zeros(20), scenes, "difference")[1] == pytest.approx(t * math.sqrt(more / 2) / n)
+def test_lengths_that_are_all_alike_are_no_certainty():
+    found = estimate_mean([60.0] * 4, list("abcd"), TRAJ)
+    assert found.value == 60 and found.low < 40 and found.high > 80
+    same = estimate_difference([60.0] * 4, [60.0] * 4, list("abcd"), TRAJ)
+    assert same.low < -10 and same.high > 10
+    one = estimate_mean([60.0] * 4, ["a"] * 4, TRAJ)
+    assert one.low < 50 and one.high > 70
+    assert math.isnan(estimate_mean([3.0], ["a"], TRAJ).low)
+
+
+def test_unequal_scenes_count_as_fewer():
+    assert count_effective(np.full(7, 5.0)) == pytest.approx(7)
+    assert count_effective(np.array([40.0] + [1.0] * 9)) == pytest.approx(49**2 / 1609)
+    values = [1.0, 0.0] * 24 + [1.0]
+    equal = estimate_mean(values, [f"s{i // 5}" for i in range(49)], SR)
+    unequal = estimate_mean(values, ["big"] * 40 + [f"s{i}" for i in range(9)], SR)
+    assert equal.high - equal.low < 40 and unequal.high - unequal.low > 90
+
+
+def test_a_design_effect_that_nothing_shows_is_the_usual_one():
+    counts = np.full(6, 5.0)
+    assert design_effect(np.zeros(6), 0.0, counts) == pytest.approx(1 + 0.2 * 4)
+    assert design_effect(np.array([0, 5.0, 5, 0, 5, 0]), 15.0, counts) == pytest.approx(6.0, abs=0.2)
+
+
+def test_clusters_are_at_least_two():
     with pytest.raises(ArgumentError, match="at least 2 clusters, got 1"):
-        clustered_t(np.zeros(4), np.zeros(4), "rate")
+        clustered_interval(np.zeros(4), np.zeros(4), "rate")
 
 
-@settings(max_examples=40)  # statsmodels collects all garbage at every call
+@settings(max_examples=10)  # statsmodels collects all garbage at every call
 @given(st.lists(st.floats(0, 1), min_size=1, max_size=9))
 def test_holm_is_statsmodels(p_values):
     multitest = pytest.importorskip("statsmodels.stats.multitest")
@@ -245,23 +336,56 @@ def test_holm_is_statsmodels(p_values):
 
 def test_arms_of_one_table_are_one_family_of_tests():
     wins = {"none": 0, "copy": 1, "warp": 6, "oracle": 9}
-    outcomes = [outcome(arm, i, float(i < wins[arm])) for arm in wins for i in range(12)]
-    summary = summarise(list(wins), outcomes, episodes=12)
+    rows = [outcome(arm, i, float(i < wins[arm])) for arm in wins for i in range(12)]
+    summary = summarise(list(wins), [{**row, "scene": str(row["episode"])} for row in rows], episodes=12)
     found = [summary.difference(arm, "none") for arm in ("copy", "warp", "oracle")]
     assert [d.p_value for d in found] == pytest.approx([1.0, 2 / 2**6, 2 / 2**9])
     assert [d.p_adjusted for d in found] == pytest.approx([1.0, 2 * 2 / 2**6, 3 * 2 / 2**9])
     assert summary.difference("warp", "copy").p_adjusted == pytest.approx(2 * 2 / 2**5 / 2)  # two arms, the larger p
 
 
+def test_bold_and_the_sentence_go_by_the_adjusted_test():
+    """6 won and none lost: p = 0.03 and an interval above 0, but not as one of five arms."""
+    wins = {"none": 0, "mine": 6, "a": 0, "b": 0, "c": 0, "d": 0}
+    rows = [
+        {**outcome(arm, i, float(i < wins[arm]), actions=9.0 + i % 2), "scene": str(i)}
+        for arm in wins
+        for i in range(12)
+    ]
+    alone = summarise(["none", "mine"], rows[:24], episodes=12)
+    among = summarise(list(wins), rows, episodes=12)
+    for found, is_shown in ((alone, True), (among, False)):
+        difference = found.difference("mine", "none")
+        assert difference.estimate.excludes_zero and difference.p_value == pytest.approx(2 / 2**6)
+        assert difference.is_shown == is_shown
+        console = Console(file=io.StringIO(), width=120, force_terminal=True)
+        console.print(SummaryTable.of(found))
+        assert any("\x1b[1m+50.0" in line for line in console.file.getvalue().splitlines()) == is_shown
+        assert ('class="number shown"' in summary_html(found)) == is_shown
+        assert ("no evidence" in sentence(found)) != is_shown
+
+
+def test_columns_beside_success_are_adjusted_together():
+    rng = np.random.default_rng(7)
+    rows = [
+        {**outcome(arm, i, float(rng.random() < 0.5), actions=rng.uniform(1, 60)), "scene": str(i)}
+        for arm in ("none", "x", "y")
+        for i in range(30)
+    ]
+    found = [each for each in summarise(["none", "x", "y"], rows, 30).differences if each.metric != "success"]
+    expected = holm([each.p_value for each in found])
+    assert len(found) == 4 and [each.p_adjusted for each in found] == pytest.approx(list(expected))
+
+
 def test_few_scenes_that_happen_to_be_alike_do_not_make_an_interval_narrow():
     spl = [0.9, 0.0, 0.88, 0.0, 0.0, 0.91]  # one of two reached in each of three scenes
-    low, high = clustered_t(spl, ["a", "a", "b", "b", "c", "c"], "rate")
+    low, high = clustered_interval(spl, ["a", "a", "b", "b", "c", "c"], "rate")
     assert high - low > 0.6
 
 
 def test_intervals_of_means_end_where_values_do():
     actions, scenes = [3, 60, 60, 60], ["a", "a", "b", "b"]
     found, plain = (estimate_mean(actions, scenes, metric) for metric in (TRAJ, replace(TRAJ, least=-math.inf)))
-    assert plain.low < 0 and found.low == 0 and found.high == plain.high
+    assert plain.low < 0 and found.low == 0 and found.high > 60
     worse = estimate_difference([0, 0, 50, 50], [3, 60, 60, 60], scenes, TRAJ)
     assert worse.low < 0

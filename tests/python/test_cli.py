@@ -37,7 +37,7 @@ def test_help_teaches_by_examples(capsys):
         (["export"], "--rerun first.rrd"),
         ([], "75 stopped by SIGTERM"),
         (["scenes"], "apartments:val:4"),
-        (["demo"], "oracle, the ceiling"),
+        (["demo"], "oracle, a reference"),
         (["collect"], "--out demos --workers 4"),
         (["episodes"], "--out val.json.gz"),
     ):

@@ -78,7 +78,7 @@ def test_the_page_shows_every_arm_decision_and_failure(log, page):
     classes = [attributes.get("class", "") for _, attributes in page.tags]
     assert classes.count("step") == steps and classes.count("attempt") == 8
     assert sum("chosen" in name for name in classes) == steps
-    assert "no such scene" in text and "ceiling, the true future" in text and "floor, predicts" in text
+    assert "no such scene" in text and "reference, the true future" in text and "floor, predicts" in text
     assert f"{log.numbers()['warp'].estimates['success'].value:.1f}" in text
 
 
@@ -202,8 +202,8 @@ def summary(wins, n=40, saved=0.0):
 
 
 def test_the_sentence_claims_no_more_than_the_interval_bears():
-    assert "which includes 0: no evidence of a difference" in sentence(summary(1))
-    assert "includes 0" not in sentence(summary(30)) and "75.0 points more" in sentence(summary(30))
+    assert "no evidence of a difference" in sentence(summary(1))
+    assert "no evidence" not in sentence(summary(30)) and "75.0 points more" in sentence(summary(30))
     assert "primitives" not in sentence(summary(1))
     assert "It took 2.0 fewer primitives" in sentence(summary(1, saved=2.0))
     assert sentence(summarise(["none"], [], 3)) == ""

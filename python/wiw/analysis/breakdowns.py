@@ -8,7 +8,7 @@ from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
-from wiw.analysis.statistics import Estimate, compare, estimate_mean
+from wiw.analysis.statistics import Difference, Estimate, adjust_p_values, compare, estimate_mean
 from wiw.metrics.metric import SUCCESS, Metric
 from wiw.types import Episode
 
@@ -40,6 +40,8 @@ class Breakdown:
     """Whether arms are columns, as suits few arms and many keys."""
     unit: str = "episodes"
     """Unit that estimates are means over."""
+    shown: frozenset[tuple[str, str]] = frozenset()
+    """Row and column of the differences that the test, adjusted for all of the table, finds."""
 
     @property
     def keys(self) -> tuple[str, ...]:
@@ -147,28 +149,34 @@ def compare_anytime_curves(
         metric: the score that is cut.
         seed: of the bootstrap.
     """
-    found: dict[str, dict[str, dict[str, Estimate]]] = {}
+    found: dict[str, dict[tuple[str, str], Difference]] = {}
     for arm, base in pairs:
         for cut in cuts:
             at = _make_cut_metric(metric, cut)
             both = [o["metrics"] for name in (arm, base) for o in done[name].values()]
             difference = compare(arm, base, done, at, seed) if all(at.name in each for each in both) else None
             if difference is not None:
-                found.setdefault(base, {}).setdefault(arm, {})[str(cut)] = difference.estimate
-    about = "Paired by episode."
-    return [
-        Breakdown(
-            "anytime_differences",
-            f"{metric.label} if cut, difference from {base}, points",
-            f"{metric.label} if cut, difference from {base}",
-            about,
-            "cut",
-            metric,
-            estimates,
-            base,
-        )
-        for base, estimates in found.items()
-    ]
+                found.setdefault(base, {})[arm, str(cut)] = difference
+    return [_tabulate_anytime_differences(base, cells, metric) for base, cells in found.items()]
+
+
+def _tabulate_anytime_differences(base: str, cells: Mapping[tuple[str, str], Difference], metric: Metric) -> Breakdown:
+    """Return the table of differences from one base, by arm and cut."""
+    estimates: dict[str, dict[str, Estimate]] = {}
+    for (arm, cut), difference in cells.items():
+        estimates.setdefault(arm, {})[cut] = difference.estimate
+    adjusted = zip(cells, adjust_p_values(list(cells.values())), strict=True)
+    return Breakdown(
+        "anytime_differences",
+        f"{metric.label} if cut, difference from {base}, points",
+        f"{metric.label} if cut, difference from {base}",
+        "Paired by episode.",
+        "cut",
+        metric,
+        estimates,
+        base,
+        shown=frozenset(cell for cell, difference in adjusted if difference.is_shown),
+    )
 
 
 def score_twins(done: Done, twins: Sequence[tuple[int, int]], seed: int) -> list[Breakdown]:

@@ -2,9 +2,10 @@
 """Confidence intervals for means over episodes that share scenes.
 
 Episodes of one scene share its walls, its light and its furniture: what is drawn at random is scenes. The interval
-reported is Student's t over scenes (`clustered_t`), steadied by a made-up episode or two. Where there is one scene
-only, no interval can speak of others, and those over episodes are used (`wilson`, `agresti_min`, `student`). The
-bootstrap over scenes is a second opinion: with few scenes it is too narrow. `docs/statistics.md` has measured coverage.
+reported is a score interval over as many episodes as they are worth by the scatter of scenes, with Student's quantile
+for as many scenes as they are worth (`clustered_interval`). With one scene only, no interval can speak of others, and
+those over episodes are used (`wilson`, `tango`). The bootstrap over scenes is a second opinion: with few
+scenes it is too narrow. `docs/statistics.md` has measured coverage.
 """
 
 from __future__ import annotations
@@ -17,58 +18,83 @@ from scipy import special  # its functions load ten times faster than scipy.stat
 
 from wiw.errors import ArgumentError
 
+Array = NDArray[np.float64]
 Interval = tuple[float, float]
 Kind = Literal["rate", "difference", "length"]
 """Values in [0, 1]; differences of two such; any numbers."""
 COINS = {"rate": (0.5, 0.5), "difference": (0.0, 0.5)}
 """Mean and mean square of an episode in which the success of each arm is a fair coin."""
 
-FEW = 5
-"""Scenes below which equal means are taken for chance: scenes never count as more alike than their episodes are."""
+USUAL_CORRELATION, USUAL_WEIGHT = 0.2, 0.25
+"""Correlation within scenes that is assumed where the outcomes hardly vary, and the sum of squared deviations that this
+assumption counts for. Few successes cannot show whether they gather in few scenes."""
+LENGTH_WEIGHT = 4
+"""Made-up episodes that steady lengths, two at either end of their range, as Agresti and Coull (1998) have it."""
+HALVINGS = 40
+"""Steps of the bisection for an end of Tango's interval: to 2e-12."""
 
 
-def wilson(mean: float, n: int, confidence: float = 0.95) -> Interval:
+def wilson(mean: float, n: float, confidence: float = 0.95) -> Interval:
     """Return the score interval of a proportion (Wilson 1927).
 
     Also holds, conservatively, for the mean of any values in [0, 1]: their variance is at most mean * (1 - mean).
     """
-    z = special.ndtri(0.5 + confidence / 2)
-    center = (mean + z * z / (2 * n)) / (1 + z * z / n)
-    half = z / (1 + z * z / n) * np.sqrt(mean * (1 - mean) / n + z * z / (4 * n * n))
-    return max(0.0, float(center - half)), min(1.0, float(center + half))
+    low, high = score_rate(mean, n, special.ndtri(0.5 + confidence / 2))
+    return float(low), float(high)
 
 
-def student(values: ArrayLike, confidence: float = 0.95) -> Interval:
-    """Return Student's t interval of a mean; (nan, nan) for a single value."""
-    data = np.asarray(values, np.float64)
-    if len(data) < 2:
-        return float("nan"), float("nan")
-    half = special.stdtrit(len(data) - 1, 0.5 + confidence / 2) * data.std(ddof=1) / np.sqrt(len(data))
-    return float(data.mean() - half), float(data.mean() + half)
+def tango(differences: ArrayLike, confidence: float = 0.95) -> Interval:
+    """Return the score interval of a mean paired difference in [-1, 1].
 
-
-def agresti_min(differences: ArrayLike, confidence: float = 0.95) -> Interval:
-    """Return the interval of a mean paired difference in [-1, 1], with half a win, half a loss and a tie added.
-
-    Source: Agresti and Min, Statistics in Medicine 24 (2005), where differences are -1, 0 or 1. A difference in between
-    counts as that share of a win or a loss, which overstates its variance and so errs on the safe side.
+    Source: Tango, Statistics in Medicine 17 (1998), where differences are -1, 0 or 1. With values in between, as many
+    wins and losses are reckoned with as have the same mean and mean square.
     """
     data = np.asarray(differences, np.float64)
-    n = len(data) + 2
-    wins, losses = data.clip(0).sum() + 0.5, (-data).clip(0).sum() + 0.5
-    center = (wins - losses) / n
-    half = special.ndtri(0.5 + confidence / 2) * np.sqrt(wins + losses - (wins - losses) ** 2 / n) / n
-    return max(-1.0, float(center - half)), min(1.0, float(center + half))
+    z = special.ndtri(0.5 + confidence / 2)
+    low, high = score_difference(data.mean(), np.square(data).mean(), len(data), z)
+    return float(low), float(high)
 
 
-def clustered_t(values: ArrayLike, clusters: ArrayLike, kind: Kind, confidence: float = 0.95) -> Interval:
-    """Return the interval of the pooled mean with clusters as the sampling unit: Student's t over clusters.
+def score_rate(mean: ArrayLike, n: ArrayLike, quantile: ArrayLike) -> tuple[Array, Array]:
+    """Return both ends of Wilson's interval for arrays of means, episodes and quantiles."""
+    p, n, z = (np.asarray(values, np.float64) for values in (mean, n, quantile))
+    center = (p + z * z / (2 * n)) / (1 + z * z / n)
+    half = z / (1 + z * z / n) * np.sqrt(np.maximum(p * (1 - p) / n + z * z / (4 * n * n), 0))
+    return np.maximum(center - half, 0.0), np.minimum(center + half, 1.0)
+
+
+def score_difference(mean: ArrayLike, mean_square: ArrayLike, n: ArrayLike, quantile: ArrayLike) -> tuple[Array, Array]:
+    """Return both ends of Tango's interval for arrays: the differences that a score test does not reject."""
+    q, square, n, z = np.broadcast_arrays(*(np.asarray(v, np.float64) for v in (mean, mean_square, n, quantile)))
+    won = np.maximum.reduce([(square + q) / 2, q, np.zeros_like(q)])
+    lost = won - q
+
+    def is_held(gap: Array) -> NDArray[np.bool_]:
+        """Return whether the score test does not reject a true difference; its nuisance is the share lost."""
+        linear = -won - lost + (2 - won + lost) * gap
+        share = (np.sqrt(np.maximum(linear**2 + 8 * lost * gap * (1 - gap), 0)) - linear) / 4
+        held: NDArray[np.bool_] = n * (q - gap) ** 2 <= z * z * np.maximum(2 * share + gap * (1 - gap), 0)
+        return held
+
+    inside, outside = np.stack([q, q]), np.stack([-np.ones_like(q), np.ones_like(q)])
+    for _ in range(HALVINGS):
+        middle = (inside + outside) / 2
+        held = is_held(middle)
+        inside, outside = np.where(held, middle, inside), np.where(held, outside, middle)
+    return inside[0], inside[1]
+
+
+def clustered_interval(
+    values: ArrayLike, clusters: ArrayLike, kind: Kind, confidence: float = 0.95, span: float | None = None
+) -> Interval:
+    """Return the interval of the pooled mean with clusters as the sampling unit; see `interval_of_sums`.
 
     Args:
         values: float [n], one an episode.
         clusters: [n] labels, e.g. scenes; at least two distinct ones.
         kind: what the values are; the interval stays in their range.
         confidence: e.g. 0.95.
+        span: width of the range in which lengths lie; that of the values if not given.
 
     Raises:
         ArgumentError: fewer than two clusters.
@@ -76,70 +102,144 @@ def clustered_t(values: ArrayLike, clusters: ArrayLike, kind: Kind, confidence: 
     data = np.asarray(values, np.float64)
     sums, counts = sum_by_cluster(data, np.asarray(clusters))
     if len(sums) < 2:
-        raise ArgumentError(f"clustered_t: expected at least 2 clusters, got {len(sums)}")
-    low, high = t_of_sums(sums, np.square(data).sum(), counts, kind, confidence)
+        raise ArgumentError(f"clustered_interval: expected at least 2 clusters, got {len(sums)}")
+    reach = float(np.ptp(data)) if span is None else span
+    low, high = interval_of_sums(sums, np.square(data).sum(), counts, kind, confidence, reach)
     return float(low), float(high)
 
 
-def t_of_sums(
-    sums: NDArray[np.float64],
+def interval_of_sums(
+    sums: Array,
     squares: ArrayLike,
-    counts: NDArray[np.float64],
+    counts: Array,
     kind: Kind,
     confidence: float = 0.95,
-) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Return both ends of `clustered_t`, for many runs at once.
+    span: float = 0.0,
+) -> tuple[Array, Array]:
+    """Return both ends of `clustered_interval`, for many runs at once.
 
-    The variance of the mean is that of leaving out one cluster at a time. It is blind where few episodes differ (five
-    scenes without a success have no variance), so rates and differences get a few made-up episodes more, as Agresti
-    and Coull (1998) and Agresti and Min (2005) have it: with D = variance by clusters / variance by episodes, the
-    design effect, the interval is q +- t sqrt(D v / (n + w)), q and v being mean and variance over all n + w. Their
-    weight w is 2 (z / t)^2: 2 for many clusters, less for few, where t alone is wide. So the coverage is nearest to
-    95 % (`docs/statistics.md`).
+    For rates and differences it is the score interval (Wilson, Tango) over n / D episodes, D being the design effect,
+    with Student's quantile for as many degrees of freedom as the scenes have; never narrower than the score interval
+    over all n episodes as if they were independent. So Korn and Graubard (1998) do with Clopper and Pearson's interval.
+    For lengths it is Student's t interval over clusters with the same D, steadied by made-up episodes at either end of
+    their range, and no wider than the range to either side.
 
     Args:
         sums: float [..., clusters] of the values in each.
         squares: float [...], sum of squared values over all episodes.
         counts: float [clusters], episodes in each.
-        kind: see `clustered_t`.
+        kind: see `clustered_interval`.
         confidence: e.g. 0.95.
+        span: width of the range in which lengths lie.
     """
-    mean = sums.sum(-1) / counts.sum()
-    center, variance = stabilise_mean(sums, squares, counts, kind)
-    half = special.stdtrit(len(counts) - 1, 0.5 + confidence / 2) * np.sqrt(variance)
-    low, high = np.minimum(center - half, mean), np.maximum(center + half, mean)
-    least, most = {"rate": (0.0, 1.0), "difference": (-1.0, 1.0), "length": (-np.inf, np.inf)}[kind]
-    return np.maximum(low, least), np.minimum(high, most)
-
-
-def stabilise_mean(
-    sums: NDArray[np.float64], squares: ArrayLike, counts: NDArray[np.float64], kind: Kind
-) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Return the mean and its variance by clusters, over the episodes and the pseudo-episodes; see `t_of_sums`."""
-    n, total = counts.sum(), sums.sum(-1)
-    mean, variance = total / n, jackknife_covariance(sums, sums, counts)
+    n = counts.sum()
+    mean, mean_square = sums.sum(-1) / n, np.asarray(squares, np.float64) / n
+    quantile = special.stdtrit(count_degrees(sums, counts), 0.5 + confidence / 2)
     if kind == "length":
-        return mean, variance
-    squares = np.asarray(squares, np.float64)
-    plain = (squares / n - mean**2) / n
-    seen = (plain > 1e-12) & (variance > 1e-12)
-    effect = np.where(seen, variance / np.where(seen, plain, 1.0), 1.0)
-    if len(counts) < FEW:
-        effect = np.maximum(effect, 1.0)
+        half = np.minimum(quantile * np.sqrt(steady_variance(sums, squares, counts, span)), span)
+        return mean - half, mean + half
+    effect = design_effect(sums, squares, counts)
+    plain = np.full_like(mean, special.ndtri(0.5 + confidence / 2))
+    sizes, quantiles = np.stack([n / effect, np.full_like(mean, n)]), np.stack([quantile + 0 * plain, plain])
+    if kind == "rate":
+        low, high = score_rate(mean, sizes, quantiles)
+    else:
+        low, high = score_difference(mean, mean_square, sizes, quantiles)
+    return low.min(0), high.max(0)
+
+
+def p_value_of_sums(sums: Array, squares: ArrayLike, counts: Array, kind: Kind, span: float = 0.0) -> Array:
+    """Return the two-sided p of a mean of 0: 1 - the confidence at which `interval_of_sums` ends there.
+
+    Args:
+        sums: float [..., clusters], of differences.
+        squares: as there.
+        counts: as there.
+        kind: "difference" or "length".
+        span: as there.
+    """
+    n, total = counts.sum(), sums.sum(-1)
+    if kind == "length":
+        variance, effect = steady_variance(sums, squares, counts, span), np.ones_like(total)
+    else:  # the score test: the variance is the one of a mean of 0
+        variance = np.maximum(np.asarray(squares, np.float64), np.abs(total)) / n**2
+        effect = np.maximum(design_effect(sums, squares, counts), 0)
+    error = np.sqrt(np.where(variance > 0, variance, np.inf))
+    ratio = np.abs(total) / n / error
+    p_value = 2 * special.stdtr(count_degrees(sums, counts), -ratio / np.sqrt(np.where(effect > 0, effect, 1e-12)))
+    found: Array = p_value if kind == "length" else np.maximum(p_value, 2 * special.ndtr(-ratio))
+    return found
+
+
+def steady_variance(sums: Array, squares: ArrayLike, counts: Array, span: float) -> Array:
+    """Return the variance of a mean length by clusters, with made-up episodes at either end of the range."""
+    n, mean = counts.sum(), sums.sum(-1) / counts.sum()
+    added = LENGTH_WEIGHT * span**2 / 4
+    apart = np.maximum(np.asarray(squares, np.float64) - n * mean**2, 0)
+    found: Array = design_effect(sums, squares, counts, span) * (apart + added) / n**2
+    return found
+
+
+def count_effective(counts: Array) -> float:
+    """Return the number of equal clusters that say as much as these: (sum n)^2 / sum n^2 (Kish 1965)."""
+    return float(counts.sum() ** 2 / np.square(counts).sum())
+
+
+def count_degrees(sums: Array, counts: Array) -> Array:
+    """Return the degrees of freedom of the variance over clusters, at most one less than their effective number.
+
+    Where few clusters make up most of the scatter, its own variance is large, by the kurtosis k of the clusters'
+    residuals: 2 clusters / (k - 1) degrees, which is as many as clusters for a normal distribution.
+    """
+    limit = count_effective(counts) - 1
+    if counts.max() == 1:  # no episodes share a scene
+        return np.full(sums.shape[:-1], limit)
+    mean = sums.sum(-1, keepdims=True) / counts.sum()
+    apart = np.square(sums - mean * counts)
+    scatter = np.square(apart.sum(-1))
+    peaked = len(counts) * np.square(apart).sum(-1) - scatter
+    degrees = 2 * len(counts) * scatter / np.where(peaked > 1e-12 * scatter, peaked, np.inf)
+    found: Array = np.where(peaked > 1e-12 * scatter, np.clip(degrees, min(1.0, limit), limit), limit)
+    return found
+
+
+def design_effect(sums: Array, squares: ArrayLike, counts: Array, span: float = 1.0) -> Array:
+    """Return variance of the mean by clusters / variance by episodes, steadied by `USUAL_CORRELATION`.
+
+    It is unknown where no two values differ, and then that of the usual correlation.
+    """
+    n = counts.sum()
+    mean = sums.sum(-1) / n
+    apart = np.maximum(np.asarray(squares, np.float64) - n * mean**2, 0)
+    seen = apart > 1e-9 * max(span, 1e-12) ** 2
+    effect = jackknife_covariance(sums, sums, counts) * n**2 / np.where(seen, apart, 1.0)
+    usual = 1 + USUAL_CORRELATION * (float(np.square(counts).sum() / n) - 1)
+    weight = USUAL_WEIGHT * span**2
+    steadied: Array = np.where(seen, (apart * effect + weight * usual) / np.where(seen, apart + weight, 1.0), usual)
+    return steadied
+
+
+def stabilise_mean(sums: Array, squares: ArrayLike, counts: Array, kind: Kind) -> tuple[Array, Array]:
+    """Return the mean of rates or differences and its variance by clusters, with made-up episodes of fair coins.
+
+    For quotients (`wiw.analysis.utility`), which have no score interval. Agresti and Coull (1998), Agresti and Min
+    (2005) add as many.
+    """
+    n = counts.sum()
     coin, coin_square = COINS[kind]
-    weight = count_pseudo_episodes(len(counts))
-    center = (total + weight * coin) / (n + weight)
-    return center, effect * ((squares + weight * coin_square) / (n + weight) - center**2) / (n + weight)
+    weight = count_pseudo_episodes(special.stdtrit(count_degrees(sums, counts), 0.975))
+    center = (sums.sum(-1) + weight * coin) / (n + weight)
+    spread = (np.asarray(squares, np.float64) + weight * coin_square) / (n + weight) - center**2
+    return center, design_effect(sums, squares, counts) * spread / (n + weight)
 
 
-def count_pseudo_episodes(clusters: int) -> float:
-    """Return the number of pseudo-episodes that stabilise an interval over `clusters` clusters."""
-    return float(2 * (special.ndtri(0.975) / special.stdtrit(clusters - 1, 0.975)) ** 2)
+def count_pseudo_episodes(quantile: ArrayLike) -> Array:
+    """Return the number of pseudo-episodes that steady a 95 % interval with this quantile: 2 where it is 1.96."""
+    found: Array = 2 * (special.ndtri(0.975) / np.asarray(quantile, np.float64)) ** 2
+    return found
 
 
-def jackknife_covariance(
-    first: NDArray[np.float64], second: NDArray[np.float64], counts: NDArray[np.float64]
-) -> NDArray[np.float64]:
+def jackknife_covariance(first: Array, second: Array, counts: Array) -> Array:
     """Return the covariance of two pooled means, from leaving out one cluster at a time (jackknife).
 
     Args:
@@ -150,7 +250,7 @@ def jackknife_covariance(
     clusters = len(counts)
     without = [(sums.sum(-1, keepdims=True) - sums) / (counts.sum() - counts) for sums in (first, second)]
     apart = [means - means.mean(-1, keepdims=True) for means in without]
-    found: NDArray[np.float64] = (clusters - 1) / clusters * (apart[0] * apart[1]).sum(-1)
+    found: Array = (clusters - 1) / clusters * (apart[0] * apart[1]).sum(-1)
     return found
 
 
@@ -190,17 +290,13 @@ def clustered_bootstrap(
     return float(low), float(high)
 
 
-def sum_by_cluster(
-    values: NDArray[np.float64], clusters: NDArray[np.generic]
-) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+def sum_by_cluster(values: Array, clusters: NDArray[np.generic]) -> tuple[Array, Array]:
     """Return the sums of the values and numbers of episodes, by cluster."""
     _, members = np.unique(clusters, return_inverse=True)
     return np.bincount(members, values).astype(np.float64), np.bincount(members).astype(np.float64)
 
 
-def _bca_levels(
-    means: NDArray[np.float64], sums: NDArray[np.float64], counts: NDArray[np.float64], tails: NDArray[np.float64]
-) -> NDArray[np.float64]:
+def _bca_levels(means: Array, sums: Array, counts: Array, tails: Array) -> Array:
     """Return quantile levels corrected for median bias and, from leaving out one cluster at a time, for skewness."""
     estimate = sums.sum() / counts.sum()
     below = np.mean(means < estimate) + np.mean(means == estimate) / 2
@@ -212,5 +308,5 @@ def _bca_levels(
     bias = special.ndtri(below)
     acceleration = np.sum(influence**3) / (6 * spread**1.5)
     shifted = bias + special.ndtri(tails)
-    levels: NDArray[np.float64] = special.ndtr(bias + shifted / (1 - acceleration * shifted))
+    levels: Array = special.ndtr(bias + shifted / (1 - acceleration * shifted))
     return levels

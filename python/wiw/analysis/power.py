@@ -10,7 +10,8 @@ from typing import Any
 import numpy as np
 from scipy import stats
 
-from wiw.analysis.intervals import t_of_sums
+from wiw.analysis.flip_test import FEWEST_SCENES, approximate_flips
+from wiw.analysis.intervals import p_value_of_sums
 from wiw.analysis.simulate import draw_outcome_counts, sum_by_scene
 from wiw.errors import ArgumentError
 
@@ -44,7 +45,7 @@ class Power:
     by_interval: float
     """Chance, in simulated runs, that the 95 % interval of the difference excludes 0 on its side."""
     by_test: float
-    """The same for the exact McNemar test."""
+    """The same for the test that p in tables is of (`wiw.analysis.flip_test`)."""
 
     @property
     def episodes(self) -> int:
@@ -61,7 +62,7 @@ class Power:
         return (
             f"{self.episodes} episodes in {self.scenes} scenes ({self.per_scene} each) show a difference of "
             f"{self.difference:+g} points to {self.base:g} %{among} with a chance of {100 * self.by_interval:.0f} % by "
-            f"its interval and {100 * self.by_test:.0f} % by McNemar's test, if {self.wins:g} % of episodes are won, "
+            f"its interval and {100 * self.by_test:.0f} % by the test, if {self.wins:g} % of episodes are won, "
             f"{self.losses:g} % are lost, and episodes of a scene correlate by {self.correlation:g}."
         )
 
@@ -87,7 +88,7 @@ def power(
         wiw.power(10, arms=4)      # the same as one of four arms, whose p values Holm adjusts
         wiw.power(scenes=40)       # what 200 episodes in 40 scenes can show
 
-    The fewest scenes for which the t interval of the difference excludes 0 often enough are found by its noncentral t
+    The fewest scenes for which the interval of the difference excludes 0 often enough are found by a noncentral t
     distribution, and the chance is then measured in simulated runs; scenes are added until it is what was asked for.
     The least difference is sought in simulated runs, to a tenth of a point.
 
@@ -199,14 +200,15 @@ def simulate_power(
     confidence: float,
     rng: np.random.Generator,
 ) -> tuple[float, float]:
-    """Return the shares of simulated runs whose interval, and whose McNemar test, show which arm is better."""
+    """Return the shares of simulated runs whose interval, and whose test, show which arm is better."""
     runs = max(400, min(8000, _DRAWS // scenes))
-    counts = draw_outcome_counts([won, lost, 1 - won - lost], scenes, per_scene, correlation, runs, rng)
+    sizes = [per_scene] * scenes
+    counts = draw_outcome_counts([won, lost, 1 - won - lost], sizes, correlation, runs, rng)
     sums, squares = sum_by_scene(counts, [1, -1, 0])
-    low, _ = t_of_sums(sums, squares, np.full(scenes, float(per_scene)), "difference", confidence)
-    wins, losses, _ = counts.sum(1).T
-    p_values = np.minimum(1.0, 2 * stats.binom.cdf(np.minimum(wins, losses), wins + losses, 0.5))
-    return float(np.mean(low > 0)), float(np.mean((p_values <= 1 - confidence) & (wins > losses)))
+    by_interval = p_value_of_sums(sums, squares, np.array(sizes, np.float64), "difference")
+    by_test = approximate_flips(sums) if scenes >= FEWEST_SCENES else by_interval
+    level, better = 1 - confidence + 1e-12, sums.sum(-1) > 0
+    return float(np.mean((by_interval <= level) & better)), float(np.mean((by_test <= level) & better))
 
 
 def _check(

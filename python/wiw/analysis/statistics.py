@@ -3,16 +3,29 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
-from scipy import special
 
-from wiw.analysis.intervals import Interval, Kind, agresti_min, clustered_bootstrap, clustered_t, student, wilson
-from wiw.metrics.metric import Metric
+from wiw.analysis.flip_test import find_p_value
+from wiw.analysis.intervals import (
+    Interval,
+    Kind,
+    clustered_bootstrap,
+    clustered_interval,
+    count_effective,
+    sum_by_cluster,
+    tango,
+    wilson,
+)
+from wiw.metrics.metric import SUCCESS, Metric
+
+LEVEL = 0.05
+"""Adjusted p up to which a difference counts as shown."""
 
 
 @dataclass(frozen=True)
@@ -28,6 +41,8 @@ class Estimate:
     method: str
     bootstrap: Interval | None = None
     """A second opinion: the bootstrap over scenes, too narrow where they are few; None for one scene."""
+    effective_scenes: float = 1.0
+    """Scenes with equally many episodes each that would say as much."""
 
     @property
     def excludes_zero(self) -> bool:
@@ -47,16 +62,23 @@ class Difference:
     wins: int
     """Episodes where the arm is better."""
     losses: int
-    p_value: float | None
-    """Exact McNemar test, for 0/1 metrics."""
-    p_adjusted: float | None = None
-    """The same, adjusted by Holm for all arms that are compared with this base."""
+    p_value: float
+    """Two-sided test over scenes (`wiw.analysis.flip_test`)."""
+    p_adjusted: float = 1.0
+    """The same, adjusted by Holm: of SR for all arms that are compared with this base, of other metrics for all of
+    theirs."""
+
+    @property
+    def is_shown(self) -> bool:
+        """Whether the adjusted test finds a difference; tables have it in bold."""
+        return self.p_adjusted <= LEVEL
 
 
 def estimate_mean(values: ArrayLike, scenes: Sequence[str], metric: Metric, *, seed: int = 0) -> Estimate:
     """Return the mean over episodes with a 95 % interval over scenes (`intervals`); `seed` is the bootstrap's."""
     data = np.asarray(values, np.float64)
-    found = _estimate(data, scenes, metric, "rate" if metric.kind == "rate" else "length", seed)
+    kind: Kind = "rate" if metric.kind == "rate" else "length"
+    found = _estimate(data, scenes, metric, kind, _measure_span(data, metric), seed)
     return replace(found, low=max(found.low, metric.scale * metric.least))
 
 
@@ -64,15 +86,27 @@ def estimate_difference(
     arm: ArrayLike, base: ArrayLike, scenes: Sequence[str], metric: Metric, *, seed: int = 0
 ) -> Estimate:
     """Return the mean paired difference, arm minus base, with a 95 % interval over scenes."""
-    data = np.asarray(arm, np.float64) - np.asarray(base, np.float64)
-    return _estimate(data, scenes, metric, "difference" if metric.kind == "rate" else "length", seed)
+    data, kind, span = _subtract(arm, base, metric)
+    return _estimate(data, scenes, metric, kind, span, seed)
 
 
-def mcnemar(arm: ArrayLike, base: ArrayLike) -> float:
-    """Return the two-sided p of the exact McNemar test on paired 0/1 outcomes."""
-    data = np.asarray(arm, np.float64) - np.asarray(base, np.float64)
-    wins, differing = int((data > 0).sum()), int((data != 0).sum())
-    return 1.0 if differing == 0 else min(1.0, 2 * float(special.bdtr(min(wins, differing - wins), differing, 0.5)))
+def compute_p_value(arm: ArrayLike, base: ArrayLike, scenes: Sequence[str], metric: Metric, *, seed: int = 0) -> float:
+    """Return the two-sided p of no paired difference, by the test that knows scenes (`wiw.analysis.flip_test`)."""
+    data, kind, span = _subtract(arm, base, metric)
+    return find_p_value(data, scenes, kind, span, seed=seed)
+
+
+def _subtract(arm: ArrayLike, base: ArrayLike, metric: Metric) -> tuple[NDArray[np.float64], Kind, float]:
+    """Return paired differences, their kind, and their span: as two arms scatter, the range's width times root 2."""
+    both = np.asarray(arm, np.float64), np.asarray(base, np.float64)
+    kind: Kind = "difference" if metric.kind == "rate" else "length"
+    return both[0] - both[1], kind, math.sqrt(2) * _measure_span(np.concatenate(both), metric)
+
+
+def _measure_span(values: NDArray[np.float64], metric: Metric) -> float:
+    """Return the width of the range that values of a metric are known to have."""
+    least = metric.least if math.isfinite(metric.least) else values.min()
+    return float(values.max() - least)
 
 
 def holm(p_values: ArrayLike) -> NDArray[np.float64]:
@@ -88,12 +122,11 @@ def holm(p_values: ArrayLike) -> NDArray[np.float64]:
 
 
 def adjust_p_values(differences: Sequence[Difference]) -> tuple[Difference, ...]:
-    """Return the differences with Holm-adjusted p values; the arms of one metric are a family of tests."""
+    """Return the differences of a table with Holm-adjusted p values: SR is one family of tests, the rest another."""
     found = list(differences)
-    for metric in {difference.metric for difference in found}:
-        family = [i for i, d in enumerate(found) if d.metric == metric and d.p_value is not None]
-        p_values = np.array([found[i].p_value for i in family], np.float64)
-        for i, p_value in zip(family, holm(p_values), strict=True):
+    for is_leading in (True, False):
+        family = [i for i, one in enumerate(found) if (one.metric == SUCCESS.name) == is_leading]
+        for i, p_value in zip(family, holm([found[i].p_value for i in family]), strict=True):
             found[i] = replace(found[i], p_adjusted=float(p_value))
     return tuple(found)
 
@@ -121,7 +154,6 @@ def compare(
     scenes = [outcomes[arm][i]["scene"] for i in both]
     sign = 1 if metric.higher_is_better else -1
     gains = sign * (np.asarray(ours) - np.asarray(theirs))
-    binary = metric.kind == "rate" and set(ours) | set(theirs) <= {0, 1}
     return Difference(
         arm,
         base,
@@ -129,25 +161,31 @@ def compare(
         estimate_difference(ours, theirs, scenes, metric, seed=seed),
         int((gains > 0).sum()),
         int((gains < 0).sum()),
-        mcnemar(ours, theirs) if binary else None,
+        compute_p_value(ours, theirs, scenes, metric, seed=seed),
     )
 
 
-_OVER_EPISODES: dict[Kind, tuple[str, Callable[[NDArray[np.float64]], Interval]]] = {
-    "rate": ("Wilson", lambda data: wilson(float(data.mean()), len(data))),
-    "difference": ("Agresti-Min", agresti_min),
-    "length": ("Student t", student),
+_OVER_SCENES = {"rate": "Wilson", "difference": "Tango", "length": "Student t"}
+_OVER_EPISODES: dict[Kind, Callable[[NDArray[np.float64], float], Interval]] = {
+    "rate": lambda data, span: wilson(float(data.mean()), len(data)),
+    "difference": lambda data, span: tango(data),
+    "length": lambda data, span: (
+        clustered_interval(data, np.arange(len(data)), "length", span=span) if len(data) > 1 else (math.nan, math.nan)
+    ),
 }
 
 
-def _estimate(data: NDArray[np.float64], scenes: Sequence[str], metric: Metric, kind: Kind, seed: int) -> Estimate:
+def _estimate(
+    data: NDArray[np.float64], scenes: Sequence[str], metric: Metric, kind: Kind, span: float, seed: int
+) -> Estimate:
     groups, scale = len(set(scenes)), metric.scale
-    second = None
+    second, name = None, _OVER_SCENES[kind]
     if groups > 1:
-        name, (low, high) = f"t over {groups} scenes", clustered_t(data, list(scenes), kind)
+        name = f"{name} over {groups} scenes"
+        low, high = clustered_interval(data, list(scenes), kind, span=span)
         bootstrap = clustered_bootstrap(data, list(scenes), seed=seed)
         second = scale * bootstrap[0], scale * bootstrap[1]
     else:
-        name, interval = _OVER_EPISODES[kind]
-        low, high = interval(data)
-    return Estimate(scale * float(data.mean()), scale * low, scale * high, len(data), groups, name, second)
+        low, high = _OVER_EPISODES[kind](data, span)
+    effective = count_effective(sum_by_cluster(data, np.asarray(scenes))[1])
+    return Estimate(scale * float(data.mean()), scale * low, scale * high, len(data), groups, name, second, effective)

@@ -19,11 +19,12 @@ from wiw.analysis.breakdowns import (
     score_twins,
     split_by_kind,
 )
+from wiw.analysis.flip_test import FEWEST_SCENES
 from wiw.analysis.marks import BLIND, Marks, answer_blind, read_marks
-from wiw.analysis.statistics import Difference, Estimate, adjust_p_values, compare, estimate_mean
+from wiw.analysis.statistics import LEVEL, Difference, Estimate, adjust_p_values, compare, estimate_mean
 from wiw.analysis.utility import CEILING, FLOOR, Utility, utility
 from wiw.errors import RegistryError
-from wiw.metrics.metric import ANSWER_SCORE, Metric
+from wiw.metrics.metric import ANSWER_SCORE, SPL, SPL_RULE, Metric
 from wiw.registry import METRICS
 from wiw.runs.departures import Departure, read_departures
 from wiw.runs.judges import JudgeRecord
@@ -34,7 +35,7 @@ from wiw.types import TableSpec
 ROLES = {
     "none": "policy without a world model",
     "copy": "floor, predicts that nothing changes",
-    "oracle": "ceiling, the true future",
+    "oracle": "reference, the true future",
 }
 """Roles of the reference arms; any other arm is a world model under test, or a policy without one."""
 PLACEBOS = {
@@ -427,6 +428,7 @@ def notes(summary: Summary) -> list[str]:
     found += [*_explain_intervals(summary), *_explain_differences(summary), *_explain_utility(summary)]
     found += summary.marks.describe() if summary.marks is not None else []
     found += _explain_partial(summary)
+    found += [SPL_RULE] if summary.marks is None and SPL.name in {each.name for each in list_columns(summary)} else []
     found += [_explain_paper_name(metric) for metric in list_columns(summary) if metric.paper_name]
     found += summary.remarks()
     widest = max(
@@ -470,14 +472,31 @@ def _explain_intervals(summary: Summary) -> list[str]:
     if first.scenes == 1:
         return [f"95 % intervals over episodes of one scene ({first.method}); they do not generalise to other scenes."]
     if first.scenes == first.n:
-        return [f"95 % intervals: Student's t over {first.n} episodes, each in its own scene."]
-    few = " Few scenes make them wide: add scenes rather than episodes per scene." if first.scenes < 5 else ""
-    return [f"95 % intervals: Student's t over {first.scenes} scenes.{few}"]
+        return [f"95 % intervals over {first.n} episodes, each in its own scene."]
+    few = ""
+    if first.effective_scenes < first.scenes / 2:
+        few = (
+            f" Their numbers of episodes are so unequal that they count as {first.effective_scenes:.1f}: run "
+            "equally many in each (--per-scene)."
+        )
+    elif first.scenes < FEWEST_SCENES:
+        few = " Few scenes make them wide: add scenes rather than episodes per scene."
+    return [f"95 % intervals over {first.scenes} scenes.{few}"]
 
 
 def _explain_differences(summary: Summary) -> list[str]:
-    tested = [difference for difference in summary.differences if difference.p_adjusted is not None]
-    return ["p: exact McNemar test of SR, Holm-adjusted for the arms in its table."] if tested else []
+    first = next((difference.estimate for difference in summary.differences), None)
+    if first is None:
+        return []
+    what = "whole scenes change sides (exact sign-flip test)"
+    if first.scenes == 1:
+        what = "episodes change sides (exact sign-flip test); it says nothing of other scenes"
+    elif first.scenes < FEWEST_SCENES:
+        what = "the t test of the interval, as there are too few scenes for an exact one"
+    return [
+        f"p: {what}, Holm-adjusted for the arms in its table. Bold: adjusted p of at most {LEVEL:g}, SR by itself, the "
+        "other columns together. Intervals are not adjusted."
+    ]
 
 
 def _explain_utility(summary: Summary) -> list[str]:

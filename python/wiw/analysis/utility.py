@@ -9,11 +9,14 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 from scipy import special
 
 from wiw.analysis.intervals import (
+    Array,
     Interval,
+    clustered_interval,
+    count_degrees,
     count_pseudo_episodes,
     jackknife_covariance,
     stabilise_mean,
@@ -69,9 +72,9 @@ def utility(arm: str, done: Mapping[str, Mapping[int, Mapping[str, Any]]], refer
 def ratio(gains: ArrayLike, spans: ArrayLike, clusters: ArrayLike, confidence: float = 0.95) -> tuple[float, Interval]:
     """Return mean(gains) / mean(spans) with Fieller's interval (1954) over clusters, all nan where it is undefined.
 
-    It holds every u for which the mean of gains - u spans is within t standard errors of 0, so it is as good as the t
-    interval of a difference; a bootstrap of the quotient is too narrow (`docs/statistics.md`). It is defined where
-    that interval of mean(spans) lies above 0.
+    It holds every u for which the mean of gains - u spans is within t standard errors of 0; a bootstrap of the quotient
+    is too narrow (`docs/statistics.md`). It is defined where this holds for a bounded range of u, and where the
+    interval of mean(spans) lies above 0.
 
     Args:
         gains: float [n] in [-1, 1], arm - floor in each episode.
@@ -82,7 +85,7 @@ def ratio(gains: ArrayLike, spans: ArrayLike, clusters: ArrayLike, confidence: f
     labels = np.asarray(clusters)
     both = [np.asarray(values, np.float64) for values in (gains, spans)]
     (over, counts), (under, _) = (sum_by_cluster(values, labels) for values in both)
-    if len(counts) < 2:
+    if len(counts) < 2 or clustered_interval(both[1], labels, "difference", confidence)[0] <= 0:
         return UNKNOWN
     squares = [float(np.square(values).sum()) for values in both]
     a, var_a = map(float, stabilise_mean(over, squares[0], counts, "difference"))
@@ -91,25 +94,25 @@ def ratio(gains: ArrayLike, spans: ArrayLike, clusters: ArrayLike, confidence: f
         all_squares - float(sums.sum() ** 2 / counts.sum())
         for all_squares, sums in zip(squares, (over, under), strict=True)
     ]
-    covariance = _correlation(over, under, counts, apart) * math.sqrt(var_a * var_b)
-    t_square = float(special.stdtrit(len(counts) - 1, 0.5 + confidence / 2)) ** 2
+    degrees = min(float(count_degrees(sums, counts)) for sums in (over, under))
+    weight = float(count_pseudo_episodes(special.stdtrit(degrees, 0.975)))
+    covariance = _correlation(over, under, counts, apart, weight) * math.sqrt(var_a * var_b)
+    t_square = float(special.stdtrit(degrees, 0.5 + confidence / 2)) ** 2
     square, half_linear, constant = b * b - t_square * var_b, a * b - t_square * covariance, a * a - t_square * var_a
-    if b <= 0 or square <= 0:
+    if square <= 0:
         return UNKNOWN
     root = math.sqrt(max(0.0, half_linear**2 - square * constant))
-    return float(a / b), (float((half_linear - root) / square), float((half_linear + root) / square))
+    return float(over.sum() / under.sum()), (float((half_linear - root) / square), float((half_linear + root) / square))
 
 
-def _correlation(
-    over: NDArray[np.float64], under: NDArray[np.float64], counts: NDArray[np.float64], apart: list[float]
-) -> float:
+def _correlation(over: Array, under: Array, counts: Array, apart: list[float], weight: float) -> float:
     """Return the correlation of the two means over clusters; `apart` are sums of squared deviations over episodes.
 
     The made-up episodes count too: three fair coins, floor, arm and ceiling, give either difference a variance of 1/2
     and both a covariance of 1/4. So an arm that did as the ceiling in every episode is not certain to be its equal.
     """
     shared, *own = (float(jackknife_covariance(x, y, counts)) for x, y in ((over, under), (over, over), (under, under)))
-    scale, weight = math.sqrt(own[0] * own[1]), count_pseudo_episodes(len(counts))
+    scale = math.sqrt(own[0] * own[1])
     seen = min(1.0, max(-1.0, shared / scale)) if scale > 1e-12 else 0.0
     more = [one + weight / 2 for one in apart]
     return (seen * math.sqrt(max(0.0, apart[0] * apart[1])) + weight / 4) / math.sqrt(more[0] * more[1])

@@ -89,7 +89,7 @@ def demo(*, out: Annotated[Path | None, arg(metavar="DIR")] = None) -> int:
 
     Before each decision an agent imagines where its candidate plans would lead: not at all (none), into a world where
     nothing moves (copy, the floor), into what a small network makes of its view (warpnet; needs torch), into its view
-    warped by true depth (warp), or into the true future (oracle, the ceiling).
+    warped by true depth (warp), or into the true future (oracle, a reference).
 
     $ wiw demo
 

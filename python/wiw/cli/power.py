@@ -79,7 +79,7 @@ def _table(plans: Sequence[Power], chance: float) -> None:
         title_justify="left",
         box=box.SIMPLE_HEAD,
     )
-    for column in ("points", "won/lost %", "scenes", "episodes", "by interval %", "by McNemar %"):
+    for column in ("points", "won/lost %", "scenes", "episodes", "by interval %", "by test %"):
         table.add_column(column, justify="right")
     for one in plans:
         table.add_row(

@@ -72,6 +72,12 @@ class Metric:
 
 SUCCESS = Metric("success", "SR", "rate", True, about="Success rate: percent of episodes that succeeded.")
 SPL = Metric("spl", "SPL", "rate", True, about="Success weighted by path length, in percent.")
+SPL_RULE = (
+    "SPL: the mean of success * l / max(l, p), as in the paper; p is the path walked, l the shortest path to the goal "
+    "point itself (in primitives instead of metres where the rules say so). Success asks only for its radius, so a "
+    "detour of about that length costs nothing."
+)
+"""The formula where paths lead to a goal point."""
 ANSWER_SCORE = Metric(
     "answer_score", "Score", "rate", True, about="Mean mark of the answers, 1 to 5 mapped to 0 to 100."
 )

@@ -16,9 +16,10 @@ from wiw.analysis.costs import cost_columns, costs
 from wiw.analysis.fidelity import ArmFidelity, choose_columns, fidelity
 from wiw.analysis.marks import BLIND
 from wiw.analysis.statistics import Difference
-from wiw.analysis.summary import Summary, list_columns, notes, summarise_run
+from wiw.analysis.summary import Summary, list_columns, notes, show_p, summarise_run
 from wiw.errors import ArgumentError
 from wiw.files import atomic_file
+from wiw.metrics.metric import SPL_RULE
 from wiw.report import plots
 from wiw.report.episodes import read_stories, title, wording
 from wiw.report.story import Album
@@ -131,7 +132,7 @@ def summary_html(summary: Summary) -> str:
 
 
 def sentence(summary: Summary, words: Wording | None = None) -> str:
-    """Return the result in a few sentences that claim no more than the intervals support."""
+    """Return the result in a few sentences that claim no more than the adjusted tests support."""
     judged = [line for line in summary.arms if "success" in line.estimates and line.name != "none"]
     shown = [line for line in judged if line.role == "world model"] or judged[-1:]
     parts = []
@@ -147,7 +148,7 @@ def explain_metrics(summary: Summary, words: Wording) -> list[tuple[str, str]]:
     """Return what each column of the table of arms means in this task, and who gave the marks where there are any."""
     own = {
         "success": f"Success rate: percent of episodes that {words.succeeded}.",
-        "spl": "Success weighted by path length: a success counts as shortest path over path taken.",
+        "spl": f"Success weighted by path length. {SPL_RULE}",
         "actions": f"Mean number of executed {words.steps}.",
         "refused": "Mean number of gripper motions that ended early: out of reach, or blocked.",
     }
@@ -173,14 +174,14 @@ def _describe_gain(difference: Difference | None) -> str:
     found = difference.estimate
     against = f"{abs(found.value):.1f} points {'more' if found.value >= 0 else 'fewer'} than without a world model"
     interval = f"95 % interval {format_signed(found.low)} to {format_signed(found.high)}"
-    if found.excludes_zero:
+    if difference.is_shown:
         return f", {against} ({interval})."
-    return f", {against} ({interval}, which includes 0: no evidence of a difference)."
+    return f", {against} ({interval}, p {show_p(difference.p_adjusted)}: no evidence of a difference)."
 
 
 def _describe_actions(difference: Difference | None, words: Wording) -> str:
-    """Return the difference in actions, if its interval excludes 0."""
-    if difference is None or not difference.estimate.excludes_zero:
+    """Return the difference in actions, if the adjusted test finds one."""
+    if difference is None or not difference.is_shown:
         return ""
     found = difference.estimate
     kind = "more" if found.value > 0 else "fewer"
@@ -234,7 +235,7 @@ def _plots(
     words = wording(run.store)
     found = _plot_anytime_curves(summary)
     budget = int(max(row["metrics"].get("decisions", 0) for rows in done.values() for row in rows))
-    about = "Bars are 95 % intervals; dashed lines mark floor (copy) and ceiling (oracle)."
+    about = "Bars are 95 % intervals; dashed lines mark the floor (copy) and the oracle."
     found.append(("Success by arm", about, plots.success_by_arm(summary)))
     ways = {arm: [row for row in rows if row["geodesic"] is not None] for arm, rows in done.items()}
     if any(ways.values()):

@@ -61,7 +61,7 @@ def arm_colors(arms: Sequence[str]) -> dict[str, str]:
 
 
 def success_by_arm(summary: Summary) -> Markup:
-    """Plot success rates with their intervals; floor and ceiling as lines through the others."""
+    """Plot success rates with their intervals; floor and oracle as lines through the others."""
     lines = [line for line in summary.arms if "success" in line.estimates]
     colors = arm_colors([line.name for line in summary.arms])
     figure, axes = _figure()

@@ -18,7 +18,7 @@ from rich.text import Text
 from wiw.analysis.breakdowns import Breakdown
 from wiw.analysis.costs import cost_columns, costs
 from wiw.analysis.fidelity import choose_columns, fidelity
-from wiw.analysis.statistics import Estimate
+from wiw.analysis.statistics import Difference, Estimate
 from wiw.analysis.summary import (
     ArmSummary,
     Group,
@@ -211,18 +211,16 @@ def _utilities(summary: Summary) -> Table:
 def _breakdown_tables(breakdown: Breakdown, gap: str, width: int) -> list[Table]:
     """Return a table by kind, budget or outcome; `gap` stands between an estimate and its interval."""
     rows = breakdown.rows
-    show = _format_difference if breakdown.base else _format_mean
-    columns = [
-        Column(title, [show(row[title], gap) if title in row else Text("–") for row in rows.values()])
-        for title in breakdown.columns
-    ]
+
+    def format_cell(name: str, title: str) -> Text:
+        if title not in rows[name]:
+            return Text("–")
+        return _format_estimate(rows[name][title], gap, bool(breakdown.base), (name, title) in breakdown.shown)
+
+    columns = [Column(title, [format_cell(name, title) for name in rows]) for title in breakdown.columns]
     count = "n" if breakdown.unit == "episodes" else breakdown.unit
     columns.append(Column(count, [str(max(one.n for one in row.values())) for row in rows.values()]))
     return stack_tables(breakdown.title, list(rows), columns, width, breakdown.corner)
-
-
-def _format_mean(estimate: Estimate, gap: str) -> Text:
-    return Text(show_estimate(estimate).replace(" ", gap, 1))
 
 
 def _difference_tables(summary: Summary, group: Group, gap: str, width: int) -> list[Table]:
@@ -230,8 +228,7 @@ def _difference_tables(summary: Summary, group: Group, gap: str, width: int) -> 
     rows = list(group.rows.values())
     metrics = [metric for metric in list_columns(summary) if all(metric.name in row for row in rows)]
     columns = [
-        Column(column_title(metric), [_format_difference(row[metric.name].estimate, gap) for row in rows])
-        for metric in metrics
+        Column(column_title(metric), [_format_difference(row[metric.name], gap) for row in rows]) for metric in metrics
     ]
     leading = [row[metrics[0].name] for row in rows]
     columns.append(Column("W/L", [f"{one.wins}/{one.losses}" for one in leading]))
@@ -239,6 +236,9 @@ def _difference_tables(summary: Summary, group: Group, gap: str, width: int) -> 
     return stack_tables(group.title, list(group.rows), columns, width)
 
 
-def _format_difference(estimate: Estimate, gap: str) -> Text:
-    shown = show_estimate(estimate, signed=True).replace(" ", gap, 1)
-    return Text(shown, style="bold" if estimate.excludes_zero else "")
+def _format_difference(difference: Difference, gap: str) -> Text:
+    return _format_estimate(difference.estimate, gap, True, difference.is_shown)
+
+
+def _format_estimate(estimate: Estimate, gap: str, signed: bool, shown: bool) -> Text:
+    return Text(show_estimate(estimate, signed).replace(" ", gap, 1), style="bold" if shown else "")

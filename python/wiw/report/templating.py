@@ -29,7 +29,7 @@ def environment() -> Environment:
     )
     made.filters |= {"column": column_title, "p": show_p, "signed": format_signed, "how": _how, "number": _number}
     made.filters |= {"asset": _read_asset, "minute": _minute, "counted": _count_noun}
-    made.tests |= {"binding": _binding, "known": _is_known}
+    made.tests |= {"known": _is_known}
     return made
 
 
@@ -60,10 +60,6 @@ def _how(estimate: Estimate) -> str:
         return estimate.method
     low, high = estimate.bootstrap
     return f"{estimate.method}; bootstrap over scenes: {low:.1f} to {high:.1f}"
-
-
-def _binding(estimate: Estimate) -> bool:
-    return estimate.excludes_zero
 
 
 def _is_known(value: float | None) -> bool:

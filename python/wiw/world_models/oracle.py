@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The ceiling: a world model that is the world."""
+"""A reference: a world model that is the world."""
 
 from __future__ import annotations
 
@@ -17,7 +17,8 @@ from wiw.world_models.base import WorldModel, accepts
 class Oracle(WorldModel):
     """Carry the plan out in a fork of the simulator and return what it truly sees there.
 
-    No model can do better with the same policy, so its score is the ceiling. It alone is handed the simulator.
+    No model imagines better, so its score is the reference for what imagination is worth to a policy. It is no strict
+    ceiling: a policy may succeed by chance where futures are wrong. It alone is handed the simulator.
     """
 
     accepts = accepts(control="action", view="panorama", needs=("simulator",), causal=True, best_batch=64)
@@ -65,7 +66,7 @@ class ArmOracle(Oracle):
 
 
 def make_oracle(space: str = PRIMITIVES) -> Oracle:
-    """Carry each plan out in a fork of the simulator: the ceiling.
+    """Carry each plan out in a fork of the simulator.
 
     Return the model for plans of a space.
     """
