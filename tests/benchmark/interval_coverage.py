@@ -13,11 +13,11 @@ from pathlib import Path
 import numpy as np
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[1] / "python"))
-from coverage_grid import CORRELATIONS, DESIGNS, measure_coverage, measure_errors, truths  # noqa: E402
+from coverage_grid import CORRELATIONS, DESIGNS, measure_coverage, measure_errors, truths
 
-from wiw.analysis.intervals import clustered_bootstrap, wilson  # noqa: E402
-from wiw.analysis.simulate import draw_outcome_counts  # noqa: E402
-from wiw.analysis.utility import ratio  # noqa: E402
+from wiw.analysis.intervals import clustered_bootstrap, wilson
+from wiw.analysis.simulate import draw_outcome_counts
+from wiw.analysis.utility import ratio
 
 SHOWN = ("5 x 5", "5 x 10", "10 x 5", "10 x 10", "30 x 5", "87 x 5", "1, 2, ... 10", "20 + 9 x 5", "40 + 9 x 1")
 FEW_SHOWN = ("5 x 5", "10 x 5", "30 x 5", "87 x 5")

@@ -345,7 +345,9 @@ def test_a_task_settles_what_an_agent_leaves_open() -> None:
     assert (resolved.candidates, resolved.horizon, resolved.execute) == (2, 7, -2)
     assert agent.replace(config=resolved).config == resolved.complete()
     own = AgentConfig(horizon=9).resolve({"candidates": 4, "horizon": 5, "execute": 3}).complete()
-    assert (own.candidates, own.horizon, own.execute) == (4, 9, 7)
+    assert (own.candidates, own.horizon, own.execute) == (4, 9, 3), "another horizon, the same budget"
+    short = AgentConfig(horizon=2).resolve({"candidates": 4, "horizon": 5, "execute": 3})
+    assert short.execute == 2
     bare = agent.replace(model=None)
     assert bare.model is None and bare.config.candidates == 2 and agent.model is not None
 

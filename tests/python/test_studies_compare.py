@@ -99,7 +99,12 @@ class Moved(LineTask):
 @pytest.mark.parametrize(
     ("task", "count", "seed", "message"),
     [
-        (LineTask(budget=12), 16, None, r"task.budget is 15 in the first and 12 in the second.*preset"),
+        (
+            LineTask(budget=12),
+            16,
+            None,
+            r"unlike budgets: task.budget is 15 in the first and 12 in the second.*--unlike-budgets",
+        ),
         (LineTask(seed=1), 16, None, "task.seed is 0 in the first and 1"),
         (LineTask(), 16, 7, r"seed is 0 in the first and 7 in the second.*--seed 0"),
         (LineTask(), 12, None, r"episodes is 16 in the first and 12 in the second.*--episodes 16"),
@@ -114,6 +119,31 @@ def test_unlike_runs_are_refused_by_the_first_difference(runs, tmp_path, task, c
         wiw.compare(runs[0], tmp_path / "run")
     assert main(["compare", str(runs[0]), str(tmp_path / "run")]) == 2
     assert "cannot compare" in capsys.readouterr().err
+
+
+class Planner(LineAgent):
+    """Says how long its plans are and how much of them it carries out."""
+
+    def __init__(self, horizon, execute):
+        super().__init__(0.5)
+        self.numbers = {"horizon": horizon, "execute": execute}
+
+    def describe(self):
+        return {**super().describe(), **self.numbers}
+
+
+@pytest.mark.parametrize(("horizon", "execute", "count"), [(10, 8, 8), (5, -1, 4), (7, 0, 7)])
+def test_unlike_budgets_are_refused_unless_they_are_asked_for(tmp_path, horizon, execute, count, capsys):
+    """More primitives per decision would show as points of success; a longer plan alone does not."""
+    runs = [tmp_path / name for name in ("short", "long", "other")]
+    for run, numbers in zip(runs, [(5, 3), (horizon, execute), (10, 3)], strict=True):
+        run_arms(LineTask(), {"warp": Planner(*numbers)}, 8, out=run, progress=False)
+    message = f"unlike budgets: warp carries out 3 and {count} actions per decision"
+    with pytest.raises(StoreError, match=message):
+        wiw.compare(runs[0], runs[1])
+    assert main(["compare", *map(str, runs[:2]), "--unlike-budgets"]) == 0
+    assert f"carries out 3 and {count} actions" in " ".join(capsys.readouterr().out.split())
+    assert not any("BUDGETS" in line for line in wiw.compare(runs[0], runs[2]).remarks())
 
 
 def test_scenes_may_lie_elsewhere(runs, tmp_path):

@@ -14,7 +14,16 @@ Run = Positional[Annotated[Path, arg(metavar="RUN")]]
 Arm = Annotated[str | None, arg(metavar="NAME")]
 
 
-def compare(first: Run, second: Run, /, *, arm: Arm = None, other: Arm = None, judge: JudgeName = None) -> int:
+def compare(
+    first: Run,
+    second: Run,
+    /,
+    *,
+    arm: Arm = None,
+    other: Arm = None,
+    judge: JudgeName = None,
+    unlike_budgets: bool = False,
+) -> int:
     """Compare two runs on the same episodes, the second minus the first.
 
       $ wiw compare runs/old runs/new                          # every arm that both have
@@ -22,9 +31,9 @@ def compare(first: Run, second: Run, /, *, arm: Arm = None, other: Arm = None, j
       $ wiw compare runs/a runs/b --arm warp --other mine      # mine of the second run minus warp of the first
       $ wiw compare runs/a runs/b --judge rules+llm            # by the marks that `wiw judge` added to both
 
-    Episodes are compared in pairs, so the runs must have the same task, seed, scenes and episodes; otherwise the
-    message names the first field that differs. Other differences, such as the policy's weights or the version of wiw,
-    are listed below the table.
+    Episodes are compared in pairs, so the runs must have the same task, seed, scenes and episodes, and the same budget
+    of decisions and actions; otherwise the message names what differs. Other differences, such as the policy's
+    weights or the version of wiw, are listed below the table.
 
     Args:
         first: Folder of a run.
@@ -33,9 +42,10 @@ def compare(first: Run, second: Run, /, *, arm: Arm = None, other: Arm = None, j
         other: Arm of the second run, if it has another name there.
         judge: Judge whose marks are compared, by name or digest; each run's own if not given. Unlike judges are
             refused.
+        unlike_budgets: Compare runs whose episodes may take unlike numbers of decisions or actions nevertheless.
     """
     from wiw.report.tables import print_summary
     from wiw.studies.compare import compare as compare_runs
 
-    print_summary(compare_runs(first, second, arm, other, judge=judge))
+    print_summary(compare_runs(first, second, arm, other, judge=judge, unlike_budgets=unlike_budgets))
     return 0

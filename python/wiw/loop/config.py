@@ -19,7 +19,8 @@ class PlanConfig:
     """Numbers of the search but for how many plans it considers, which `wiw scale` varies."""
 
     horizon: Annotated[int | None, arg(metavar="L")] = None
-    """L, primitives or poses per plan; the task's own number if not given, 5 without a task."""
+    """L, primitives or poses per plan; the task's own number if not given, 5 without a task. As many of them
+    are carried out as of the task's own, unless the plan is shorter."""
     execute: Annotated[int | None, arg(metavar="N")] = None
     """Actions carried out before the next decision; 0: the whole plan; negative: all of the plan's first `horizon` but
     that many, at least one. L - 2 without a task."""
@@ -63,13 +64,13 @@ class AgentConfig(PlanConfig):
     def resolve(self, defaults: Mapping[str, Any]) -> AgentConfig:
         """Return the numbers that a run uses, with a task's `defaults` where this config leaves one open.
 
-        A task's number of executed actions belongs to the task's horizon: it is not taken where `horizon` is given
-        here and the task carries out more than one action.
+        Another horizon does not change how many actions are carried out, and so an episode's budget, unless it is
+        shorter than that.
         """
         open_names = {name for name, value in self.numbers.items() if value is None}
         taken = {name: value for name, value in defaults.items() if name in open_names}
-        if self.horizon is not None and defaults.get("execute", 0) > 1:
-            taken.pop("execute", None)
+        if self.horizon is not None and "execute" in taken:
+            taken["execute"] = max(-self.horizon, min(taken["execute"], self.horizon))
         return replace(self, **taken)
 
     def complete(self) -> AgentConfig:

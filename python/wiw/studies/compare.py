@@ -24,6 +24,7 @@ from wiw.analysis.summary import (
 )
 from wiw.analysis.utility import Utility
 from wiw.errors import ArgumentError, StoreError
+from wiw.loop.config import AgentConfig
 from wiw.report.tables import SummaryTable
 from wiw.runs.rows import to_json
 from wiw.studies.run_log import RunLog, load_run
@@ -32,6 +33,8 @@ from wiw.types import Episode
 LENGTH_TOLERANCE = 1e-3
 """Metres by which the shortest path of an episode may differ between two machines."""
 
+BUDGET_RULES = ("decisions", "actions", "limit", "budget", "execute", "horizon")
+"""Rules of tasks that say how much an episode may take."""
 MOST_NAMED = 5
 """Differences between two agents that are listed by name."""
 
@@ -67,6 +70,7 @@ def compare(
     other: str | None = None,
     *,
     judge: str | None = None,
+    unlike_budgets: bool = False,
 ) -> Comparison:
     """Compare two runs on the same episodes: run b minus run a, for each arm that both have.
 
@@ -81,6 +85,8 @@ def compare(
         other: arm of run b to compare with `arm`.
         judge: name or digest of the judge whose marks are compared (see `wiw.judge`); None for each run's own, or the
             one that a run given as an object was opened with.
+        unlike_budgets: whether to compare runs whose episodes may take unlike numbers of decisions or actions; the
+            table then says what differs.
 
     Raises:
         ArgumentError: an arm that is not there, no arm in common, or a judge that has not marked a run.
@@ -88,8 +94,10 @@ def compare(
             differs.
     """
     first, second = (_open(run, judge) for run in (a, b))
-    require_comparable(first, second)
     pairs = _pairs(first, second, arm, other)
+    require_comparable(first, second, pairs, unlike_budgets)
+    differing = list_unlike_budgets(first, second, pairs)
+    unlike = [f"UNLIKE BUDGETS: {'; '.join(differing)}."] if differing else []
     names = _names(first, second)
     sides = [
         (log, {pair[side]: f"{pair[side]} · {names[side]}" for pair in pairs})
@@ -125,7 +133,7 @@ def compare(
         both.baselines,
         both.marks,
         names,
-        tuple(line for pair in pairs for line in _describe_changes(first, second, pair)),
+        (*unlike, *(line for pair in pairs for line in _describe_changes(first, second, pair))),
         unbalanced=count_unbalanced(second),
     )
 
@@ -149,17 +157,31 @@ def _utilities(log: RunLog, labels: Mapping[str, str]) -> list[Utility]:
     return [replace(one, arm=labels[one.arm]) for one in found if one.arm in labels]
 
 
-def require_comparable(a: RunLog, b: RunLog) -> None:
-    """Check that two runs have the same task, seed and episodes, so that their episodes can be paired.
+def require_comparable(
+    a: RunLog, b: RunLog, pairs: Sequence[tuple[str, str]] = (), unlike_budgets: bool = False
+) -> None:
+    """Check that two runs have the same task, seed, episodes and budget, so that their episodes can be paired.
+
+    Args:
+        a: run.
+        b: another.
+        pairs: arms of both that are compared, whose budgets must be alike.
+        unlike_budgets: whether budgets may differ.
 
     Raises:
-        StoreError: the first field that differs, with both values and what to do.
+        StoreError: the first field that differs, with both values and what to do; of budgets all that differ.
     """
     ours, theirs = a.store.config, b.store.config
     for name in dict.fromkeys([*ours["task"], *theirs["task"]]):
         values = [_value(config["task"].get(name)) for config in (ours, theirs)]
-        if values[0] != values[1] and name != "judge":
+        if values[0] != values[1] and name not in ("judge", *BUDGET_RULES):
             _refuse(a, b, f"task.{name}", values, "run one of them again with the other's task, scenes and preset")
+    if not unlike_budgets and (differing := list_unlike_budgets(a, b, pairs)):
+        raise StoreError(
+            f"cannot compare {a.path} and {b.path}: their episodes have unlike budgets: {'; '.join(differing)}. A "
+            "larger budget raises success by itself: run one of them again with the other's numbers, or compare them "
+            "nevertheless with --unlike-budgets (unlike_budgets=True), and report both budgets"
+        )
     _require_same_judge(a, b)
     if ours["seed"] != theirs["seed"]:
         _refuse(a, b, "seed", [ours["seed"], theirs["seed"]], f"run one of them again with --seed {ours['seed']}")
@@ -169,6 +191,30 @@ def require_comparable(a: RunLog, b: RunLog) -> None:
         _refuse(a, b, "episodes", counts, f"run the shorter one again with --episodes {max(counts)}")
     for index, pair in enumerate(zip(*episodes, strict=True)):
         _require_same_episode(a, b, index, pair)
+
+
+def list_unlike_budgets(a: RunLog, b: RunLog, pairs: Sequence[tuple[str, str]]) -> list[str]:
+    """Return how the budgets of two runs differ: rules of the task, and actions that arms carry out per decision."""
+    rules = [log.store.config["task"] for log in (a, b)]
+    found = [
+        f"task.{name} is {to_json(rules[0].get(name))} in the first and {to_json(rules[1].get(name))} in the second"
+        for name in BUDGET_RULES
+        if rules[0].get(name) != rules[1].get(name)
+    ]
+    for pair in pairs:
+        executed = [_count_executed(log, arm) for log, arm in zip((a, b), pair, strict=True)]
+        if None not in executed and executed[0] != executed[1]:
+            found.append(f"{_label(pair[1], pair[0])} carries out {executed[0]} and {executed[1]} actions per decision")
+    return found
+
+
+def _count_executed(log: RunLog, arm: str) -> int | None:
+    """Return the most actions that an arm carries out per decision; None for an agent that does not say."""
+    built = log.store.info.get("built", {}).get(arm, {})
+    if not {"horizon", "execute"} <= built.keys():
+        return None
+    numbers = AgentConfig(horizon=built["horizon"], execute=built["execute"])
+    return numbers.count_executed(built["horizon"])
 
 
 def _require_same_judge(a: RunLog, b: RunLog) -> None:
