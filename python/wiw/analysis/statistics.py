@@ -11,6 +11,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from wiw.analysis.anytime import find_anytime_p
 from wiw.analysis.flip_test import find_p_value
 from wiw.analysis.intervals import (
     Interval,
@@ -96,6 +97,16 @@ def compute_p_value(arm: ArrayLike, base: ArrayLike, scenes: Sequence[str], metr
     return find_p_value(data, scenes, kind, span, seed=seed)
 
 
+def _compute_anytime_p(arm: ArrayLike, base: ArrayLike, scenes: Sequence[str], metric: Metric) -> float:
+    """Return the p that holds at any look, over means of scenes in their order; of a single scene, over episodes."""
+    data, kind, _ = _subtract(arm, base, metric)
+    if kind == "length":
+        return 1.0
+    order = list(dict.fromkeys(scenes))
+    groups = [data[[one == scene for one in scenes]] for scene in order]
+    return find_anytime_p([each.mean() for each in groups] if len(order) > 1 else data)
+
+
 def _subtract(arm: ArrayLike, base: ArrayLike, metric: Metric) -> tuple[NDArray[np.float64], Kind, float]:
     """Return paired differences, their kind, and their span: as two arms scatter, the range's width times root 2."""
     both = np.asarray(arm, np.float64), np.asarray(base, np.float64)
@@ -132,7 +143,12 @@ def adjust_p_values(differences: Sequence[Difference]) -> tuple[Difference, ...]
 
 
 def compare(
-    arm: str, base: str, outcomes: Mapping[str, Mapping[int, Mapping[str, Any]]], metric: Metric, seed: int = 0
+    arm: str,
+    base: str,
+    outcomes: Mapping[str, Mapping[int, Mapping[str, Any]]],
+    metric: Metric,
+    seed: int = 0,
+    anytime: bool = False,
 ) -> Difference | None:
     """Return the paired difference of two arms, or None without common episodes that have the metric.
 
@@ -142,6 +158,8 @@ def compare(
         outcomes: for each arm, scored episodes by index with "scene" and "metrics".
         metric: which metric.
         seed: of the bootstrap.
+        anytime: whether p must hold however often the run was looked at before it was stopped; of lengths it is then 1,
+            as the bets need bounds.
     """
     both = [
         index
@@ -161,7 +179,9 @@ def compare(
         estimate_difference(ours, theirs, scenes, metric, seed=seed),
         int((gains > 0).sum()),
         int((gains < 0).sum()),
-        compute_p_value(ours, theirs, scenes, metric, seed=seed),
+        compute_p_value(ours, theirs, scenes, metric, seed=seed)
+        if not anytime
+        else _compute_anytime_p(ours, theirs, scenes, metric),
     )
 
 

@@ -124,6 +124,8 @@ class Summary:
     """Episodes whose question is asked in one scene only, so that its text may give the answer away."""
     trackers: Mapping[str, str] = field(default_factory=dict, kw_only=True)
     """Trackers of targets in imagined frames by name, each with "frames" or "poses", whichever it followed."""
+    looks: str = field(default="", kw_only=True)
+    """Sentences on the rule by which the run was to stop early, and on whether it did; empty without one."""
     departures: tuple[Departure, ...] = field(default=(), kw_only=True)
     """Where the run departs from the paper's protocol."""
 
@@ -217,6 +219,7 @@ def summarise(
     twins: Sequence[tuple[int, int]] = (),
     judge: JudgeRecord | None = None,
     pairs: Sequence[tuple[str, str]] | None = None,
+    anytime: bool = False,
 ) -> Summary:
     """Return the numbers of a run.
 
@@ -230,6 +233,7 @@ def summarise(
         twins: pairs of episodes that are twins.
         judge: whose marks the outcomes have, where answers are judged.
         pairs: arms whose anytime curves are compared, each with its base; None for each arm with "none" and "copy".
+        anytime: whether the run was looked at before it was stopped, so that p must allow for that.
     """
     done, errors = split_outcomes(arms, outcomes)
     lines = tuple(_line(arm, role_of(arm, policies), done[arm], errors[arm], episodes, seed) for arm in arms)
@@ -237,7 +241,7 @@ def summarise(
         difference
         for base in ("none", FLOOR)
         if base in arms
-        for difference in _differences_from(base, arms, done, seed)
+        for difference in _differences_from(base, arms, done, seed, anytime)
     )
     same = len({frozenset(ended) for ended in done.values()}) == 1
     blind = answer_blind(done, tables.cuts) if BLIND not in done else {}
@@ -258,15 +262,34 @@ def summarise_run(run: Run) -> Summary:
     found = summarise(
         run.arms,
         run.store.outcomes(),
-        len(episodes),
+        len(run.store.own_episodes()) if "stopped" in run.store.info else len(episodes),
         config["seed"],
         policies,
         tables=run.tables,
         twins=find_twins(episodes),
         judge=run.store.judge,
+        anytime="until" in run.store.info,
     )
     departures = read_departures(run.store.info)
-    return replace(found, unbalanced=count_unbalanced(run), trackers=_list_trackers(run), departures=departures)
+    return replace(
+        found,
+        unbalanced=count_unbalanced(run),
+        trackers=_list_trackers(run),
+        departures=departures,
+        looks=_describe_looks(run.store.info),
+    )
+
+
+def _describe_looks(info: Mapping[str, Any]) -> str:
+    """Return the rule by which a run was to stop early, and whether it did."""
+    if "until" not in info:
+        return ""
+    rule = f"The run was looked at every {info['until']['every']} episodes, to stop once {info['until']['rule']}."
+    ended = f"It stopped at {info['stopped']['why']}." if "stopped" in info else "It was not stopped so far."
+    return (
+        f"{rule} {ended} That interval is of a confidence sequence, and p of a betting test over scenes: both hold at "
+        "any look. The intervals in the tables are for a number of episodes that is fixed beforehand."
+    )
 
 
 def _list_trackers(run: Run) -> dict[str, str]:
@@ -335,10 +358,10 @@ def role_of(arm: str, policies: Collection[str] = ()) -> str:
 
 
 def _differences_from(
-    base: str, arms: Sequence[str], done: Mapping[str, Mapping[int, Mapping[str, Any]]], seed: int
+    base: str, arms: Sequence[str], done: Mapping[str, Mapping[int, Mapping[str, Any]]], seed: int, anytime: bool
 ) -> tuple[Difference, ...]:
     others = [arm for arm in arms if arm not in (base, "none")]
-    found = [compare(arm, base, done, metric, seed) for arm in others for metric in select_metrics(done)]
+    found = [compare(arm, base, done, metric, seed, anytime) for arm in others for metric in select_metrics(done)]
     return adjust_p_values([difference for difference in found if difference is not None])
 
 
@@ -430,13 +453,15 @@ def notes(summary: Summary) -> list[str]:
     found += _explain_partial(summary)
     found += [SPL_RULE] if summary.marks is None and SPL.name in {each.name for each in list_columns(summary)} else []
     found += [_explain_paper_name(metric) for metric in list_columns(summary) if metric.paper_name]
+    found += [summary.looks] if summary.looks else []
     found += summary.remarks()
     widest = max(
         (line.estimates["success"] for line in summary.arms if "success" in line.estimates),
         key=lambda estimate: estimate.high - estimate.low,
         default=None,
     )
-    if widest is not None and widest.high - widest.low > 30:
+    shown = any(difference.is_shown for difference in summary.differences)
+    if widest is not None and widest.high - widest.low > 30 and not shown:
         found.append(
             f"Too few episodes ({widest.n}) for conclusions: intervals of SR are up to "
             f"{widest.high - widest.low:.0f} points wide."
@@ -489,7 +514,9 @@ def _explain_differences(summary: Summary) -> list[str]:
     if first is None:
         return []
     what = "whole scenes change sides (exact sign-flip test)"
-    if first.scenes == 1:
+    if summary.looks:
+        what = "a betting test over scenes, which holds at any look; none of lengths"
+    elif first.scenes == 1:
         what = "episodes change sides (exact sign-flip test); it says nothing of other scenes"
     elif first.scenes < FEWEST_SCENES:
         what = "the t test of the interval, as there are too few scenes for an exact one"

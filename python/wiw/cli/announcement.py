@@ -37,11 +37,24 @@ def announce(task: Task, arms: Mapping[str, Any], config: RunConfig) -> None:
         "arms": f"{', '.join(arms)} ({'policy' if len(policies) == 1 else 'policies'} {', '.join(policies)})",
         "workers": str(config.workers),
         **({} if config.shard is None else {"shard": config.shard}),
+        **({} if config.until is None else {"until": _describe_rule(config, list(arms))}),
         "run": str(config.out),
     }
     for name, line in lines.items():
         print(f"{name:<8}{printable(line)}", file=sys.stderr)
     print(file=sys.stderr, flush=True)
+
+
+def _describe_rule(config: RunConfig, arms: list[str]) -> str:
+    """Return the rule by which the run stops early.
+
+    Raises:
+        ArgumentError: one that is not understood.
+    """
+    from wiw.analysis.stopping import parse_stop_rule
+
+    rule = parse_stop_rule(str(config.until), arms, config.look_every)
+    return f"{rule.text}; a look every {count_noun(rule.every, 'episode')} per arm"
 
 
 def announce_protocol(task: Task, arms: Mapping[str, Any], episodes: int) -> None:

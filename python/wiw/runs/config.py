@@ -51,6 +51,11 @@ class RunConfig(Limits, EngineConfig):
     keep_images: Annotated[int | Literal["all"], arg(metavar="N|all")] = 2
     """Episodes that keep pictures for report and view, of manipulation one of each task at least; all: every one, at
     0.2 MB per decision."""
+    until: Annotated[str | None, arg(metavar="RULE")] = None
+    """Stop early, once "A-B excludes 0" (a difference of SR between two arms is shown) or "width<8" (every arm's SR is
+    known to so many points; or width(A), width(A-B)), by intervals that allow for looking; --episodes is the most."""
+    look_every: Annotated[int, arg(metavar="N")] = 20
+    """Episodes per arm between two looks of --until."""
     shard: Annotated[str | None, arg(metavar="I/N")] = None
     """Part I of N of the episodes, in a store of its own; `wiw merge` makes one run of the stores of all parts."""
     scratch: Annotated[Path | str | None, arg(metavar="DIR")] = None
@@ -64,7 +69,7 @@ class RunConfig(Limits, EngineConfig):
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        for name, least in (("episodes", 1), ("workers", 1), ("live", 1), ("keep_images", 0)):
+        for name, least in (("episodes", 1), ("workers", 1), ("live", 1), ("keep_images", 0), ("look_every", 1)):
             value = getattr(self, name)
             if isinstance(value, int) and value < least:
                 raise ArgumentError(f"evaluate: expected {name} of at least {least}, got {value}")
@@ -76,6 +81,17 @@ class RunConfig(Limits, EngineConfig):
             raise ArgumentError("evaluate: address and worker_gpus are for engine ray: give --engine ray (engine=)")
         if self.shard is not None:
             Shard.parse(self.shard)
+        if self.until is not None and self.episodes is None:
+            raise ArgumentError(
+                "evaluate: until needs the most episodes that the run may have: give --episodes (episodes=)"
+            )
+        if self.until is not None and self.shard is not None:
+            raise ArgumentError("evaluate: a shard sees too little of a run to stop it: until cannot be had with shard")
+
+    @property
+    def looks(self) -> dict[str, Any] | None:
+        """Rule and number of episodes between looks, as the run store keeps them; None where nobody looks."""
+        return None if self.until is None else {"rule": self.until, "every": self.look_every}
 
     @property
     def place(self) -> EngineConfig:

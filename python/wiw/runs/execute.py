@@ -4,14 +4,14 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable, Mapping, Sequence
-from typing import Any
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from typing import Any, Protocol
 
 from wiw.errors import Error, InfrastructureError, StoreError
 from wiw.runs.config import EngineConfig
 from wiw.runs.films import film_episodes
 from wiw.runs.pictures import drop_spare_pictures
-from wiw.runs.progress import ArmProgress, Tracker, make_board
+from wiw.runs.progress import ArmProgress, Board, Tracker, make_board
 from wiw.runs.recipes import AgentRecipe, TaskRecipe
 from wiw.runs.rows import AgentRow, DecisionRow, LostRow, RestartRow
 from wiw.runs.scene_map import draw_scene_maps
@@ -19,6 +19,25 @@ from wiw.runs.sources import require_sources
 from wiw.runs.store import RunStore
 from wiw.runs.workers import Job, Row, WorkerSpec, run_here, run_in_workers
 from wiw.types import Episode, EpisodeResult
+
+
+class Look(Protocol):
+    """Findings of a look at a run that goes on; its string form is a sentence."""
+
+    @property
+    def reached(self) -> bool:
+        """Whether the run stops."""
+
+
+class Looks(Protocol):
+    """A rule for stopping a run early; see `wiw.analysis.stopping`."""
+
+    def list_bounds(self, episodes: int) -> Iterable[int]:
+        """Return the numbers of episodes at which to look, the last being all."""
+
+    def look(self, bound: int, episodes: Sequence[Episode], outcomes: Sequence[Mapping[str, Any]]) -> Look:
+        """Return what the first `bound` episodes show."""
+
 
 PROCESSES = EngineConfig()
 """Processes of this machine."""
@@ -91,8 +110,9 @@ def run_pending(
     workers: int,
     progress: bool,
     place: EngineConfig = PROCESSES,
+    looks: Looks | None = None,
 ) -> None:
-    """Run the pending episodes of each arm and close the store."""
+    """Run the pending episodes of each arm and close the store; with looks, until what they find is enough."""
     info = store.info
     episodes = store.episodes()
     pictures = frozenset(info["pictures"])
@@ -107,13 +127,32 @@ def run_pending(
             store.discard(arm, indices)
         built = task.build()
         writer = _StoreWriter(store, Tracker(_count_ended(store, pending), built.decisions, board))
-        _run_jobs(spec, episodes, pending, writer, workers, place)
+        for batch in _split_by_looks(store, episodes, pending, looks, board):
+            _run_jobs(spec, episodes, batch, writer, workers, place)
         if store.shard is None:
             drop_spare_pictures(store)
             draw_pictures(store, built)
     finally:
         board.close()
         store.close()
+
+
+def _split_by_looks(
+    store: RunStore, episodes: list[Episode], pending: Mapping[str, list[int]], looks: Looks | None, board: Board
+) -> Iterator[Mapping[str, list[int]]]:
+    """Yield the pending episodes that are to be run before the next look, until a look finds enough."""
+    if looks is None:
+        yield pending
+        return
+    begin = 0
+    for bound in looks.list_bounds(len(episodes)):
+        yield {arm: [index for index in left if begin <= index < bound] for arm, left in pending.items()}
+        look = looks.look(bound, episodes, store.outcomes())
+        board.note(f"{look}{', so the run stops' if look.reached else ''}")
+        if look.reached:
+            store.stop_after(bound, str(look))
+            return
+        begin = bound
 
 
 def draw_pictures(store: RunStore, task: Any) -> None:

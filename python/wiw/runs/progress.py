@@ -106,6 +106,9 @@ class Board(Protocol):
     def show(self, arm: str, progress: Progress) -> None:
         """Show the new state of an arm, or of another piece of work."""
 
+    def note(self, text: str) -> None:
+        """Show a sentence that stays."""
+
     def close(self) -> None:
         """Finish: the run has ended or was stopped."""
 
@@ -142,6 +145,9 @@ class SilentBoard:
     """Displays nothing."""
 
     def show(self, arm: str, progress: Progress) -> None:
+        """Do nothing."""
+
+    def note(self, text: str) -> None:
         """Do nothing."""
 
     def close(self) -> None:
@@ -201,6 +207,10 @@ class TerminalBoard:
         seconds = left * (time.monotonic() - begin) / (progress.ended - before)
         return f", about {timedelta(seconds=round(seconds))} left"
 
+    def note(self, text: str) -> None:
+        """Print it above the bars."""
+        self._console.print(text, highlight=False, markup=False, soft_wrap=True)
+
     def close(self) -> None:
         """Leave the bars as they are."""
         self._bars.stop()
@@ -214,6 +224,7 @@ class NotebookBoard:
 
         self._html = HTML
         self._arms: dict[str, Progress] = {}
+        self._notes: list[str] = []
         self._shown = 0.0
         self._handle = display(HTML(""), display_id=True)
 
@@ -232,7 +243,13 @@ class NotebookBoard:
             f"<td>{p.text}</td></tr>"
             for arm, p in self._arms.items()
         )
-        self._handle.update(self._html(f"<table>{rows}</table>"))
+        notes = "".join(f"<p>{escape(note)}</p>" for note in self._notes)
+        self._handle.update(self._html(f"<table>{rows}</table>{notes}"))
+
+    def note(self, text: str) -> None:
+        """Show it below the bars."""
+        self._notes.append(text)
+        self._draw()
 
     def close(self) -> None:
         """Draw the last state."""

@@ -445,9 +445,11 @@ class RunStore:
         return [episode for episode in self.own_episodes() if episode not in ended]
 
     def own_episodes(self) -> Sequence[int]:
-        """Return the indices of the episodes that this store is for: all, or its shard's."""
+        """Return the indices of the episodes that this store is for: all, its shard's, or up to where it stopped."""
         (counted,) = self._rows("SELECT count(*) AS n FROM episode")
-        shard = self.shard
+        shard, stopped = self.shard, self.info.get("stopped")
+        if stopped is not None:
+            return range(stopped["episodes"])
         return range(counted["n"]) if shard is None else shard.select(counted["n"])
 
     # -- writing ---------------------------------------------------------------------------------------------------
@@ -536,6 +538,12 @@ class RunStore:
         info["resumed_with"] = [*info.get("resumed_with", []), {"time": _now(), **changed}]
         with self._writing() as connection:
             connection.execute("UPDATE run SET info = ?", (to_json(info),))
+
+    def stop_after(self, episodes: int, why: str) -> None:
+        """Store that the run ends with its first `episodes` episodes, and why: the others will not be run."""
+        stopped = {"episodes": episodes, "why": why}
+        with self._writing() as connection:
+            connection.execute("UPDATE run SET info = ?", (to_json({**self.info, "stopped": stopped}),))
 
     def begin_session(self) -> None:
         """Store when and where episodes begin to be run, and how many have ended before, for `wiw status`."""

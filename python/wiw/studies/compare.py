@@ -109,6 +109,7 @@ def compare(
     labelled = [tuple(labels[arm] for arm, (_, labels) in zip(pair, sides, strict=True)) for pair in pairs]
     seed = int(first.store.config["seed"])
     episodes = first.store.episodes()
+    anytime = any("until" in log.store.info for log in (first, second))
     both = summarise(
         [label for pair in labelled for label in pair],
         outcomes,
@@ -118,10 +119,13 @@ def compare(
         twins=find_twins(episodes),
         judge=first.store.judge,
         pairs=[(theirs, ours) for ours, theirs in labelled],
+        anytime=anytime,
     )
     done, _ = split_outcomes([line.name for line in both.arms], outcomes)
     found = [
-        compare_arms(theirs, ours, done, metric, seed) for ours, theirs in labelled for metric in select_metrics(done)
+        compare_arms(theirs, ours, done, metric, seed, anytime)
+        for ours, theirs in labelled
+        for metric in select_metrics(done)
     ]
     lines = {line.name: line for log, labels in sides for line in _lines(log, both, labels)}
     return Comparison(
@@ -135,6 +139,7 @@ def compare(
         names,
         (*unlike, *(line for pair in pairs for line in _describe_changes(first, second, pair))),
         unbalanced=count_unbalanced(second),
+        looks="One of the runs was looked at before it was stopped." if anytime else "",
     )
 
 

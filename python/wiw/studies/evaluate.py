@@ -11,6 +11,7 @@ from datetime import datetime
 from pathlib import Path
 from typing import Any
 
+from wiw.analysis.stopping import StopRule, parse_stop_rule
 from wiw.errors import ArgumentError, Error, StoreError
 from wiw.loop.limits import Limits
 from wiw.metrics import Lpips
@@ -152,6 +153,7 @@ def _run(task: Any, agents: Mapping[str, Any], settings: RunConfig) -> RunLog:
         "episodes": count,
         "arms": [{"name": arm, "agent": recipe.describe()} for arm, recipe in agents.items()],
     }
+    looks = _make_looks(settings.looks, list(agents))
     for recipe in agents.values():
         recipe.require(built, count)
     if settings.shard is not None:
@@ -172,13 +174,16 @@ def _run(task: Any, agents: Mapping[str, Any], settings: RunConfig) -> RunLog:
             "agents": {arm: recipe.to_json() for arm, recipe in agents.items()},
             "sources": sources_of(task, agents),
             "departures": describe_departures(built, agents, count),
-            "pictures": pool_episodes(episodes, settings.count_pictured(count)),
+            "pictures": pool_episodes(
+                episodes if looks is None else episodes[: looks.every], settings.count_pictured(count)
+            ),
             "keep_images": settings.count_pictured(count),
             "scenes": used,
             "stage": built.stage,
             "wording": asdict(built.wording),
             "tables": asdict(built.tables),
             **({} if settings.shard is None else {"shard": settings.shard}),
+            **({} if settings.looks is None else {"until": settings.looks}),
             "live": settings.live,
             "workers": settings.workers,
             "engine": asdict(settings.place),
@@ -200,8 +205,9 @@ def _take_over(store: RunStore, settings: RunConfig) -> None:
     """
     begun_with, now = Limits(**store.info["limits"]).to_json(), settings.to_json()
     begun_with["shard"], now["shard"] = store.info.get("shard"), settings.shard
+    begun_with["until"], now["until"] = store.info.get("until"), settings.looks
     try:
-        names = ("fidelity", "lpips", "shard")
+        names = ("fidelity", "lpips", "shard", "until")
         store.require_same(*({name: each[name] for name in names} for each in (begun_with, now)))
     except StoreError:
         store.close()
@@ -222,6 +228,16 @@ def _finish(
 ) -> RunLog:
     """Run what is missing, close the store and open it for reading."""
     pending = {arm: store.pending(arm, retry_errors) for arm in agents}
-    home = store.home
-    run_pending(store, task, agents, pending, workers, progress, place)
+    home, info = store.home, store.info
+    looks = None if "stopped" in info else _make_looks(info.get("until"), list(agents))
+    run_pending(store, task, agents, pending, workers, progress, place, looks)
     return RunLog(RunStore.read(home))
+
+
+def _make_looks(until: Mapping[str, Any] | None, arms: Sequence[str]) -> StopRule | None:
+    """Return the rule by which a run stops early, from its description in the run store.
+
+    Raises:
+        ArgumentError: a rule that is not understood.
+    """
+    return None if until is None else parse_stop_rule(until["rule"], arms, until["every"])
