@@ -1,14 +1,18 @@
 # SPDX-License-Identifier: Apache-2.0
 import numpy as np
 import pytest
+from fakes import LineAgent, LineTask
 from scipy import stats
 
 import wiw
+from wiw.analysis.pilot import PILOTS, estimate_correlation, read_pilot
 from wiw.analysis.power import simulate_power
+from wiw.analysis.simulate import draw_outcome_counts
 from wiw.analysis.statistics import compute_p_value, estimate_difference, holm
 from wiw.cli import main
 from wiw.errors import ArgumentError
 from wiw.metrics.metric import SUCCESS
+from wiw.studies.evaluate import run_arms
 
 
 def test_the_power_of_flips_of_single_episodes_is_the_exact_sum():
@@ -115,3 +119,44 @@ def test_command_line(capsys):
     with pytest.raises(SystemExit):
         main(["power", "--help"])
     assert "wiw power 10 --arms 4" in capsys.readouterr().out
+
+
+def test_a_pilot_says_how_many_episodes_the_next_run_needs(tmp_path, capsys):
+    """Two arms of a run: won and lost, and how alike episodes of a scene are."""
+    run = tmp_path / "run"
+    log = run_arms(LineTask(), {"mine": LineAgent(0.7), "warp": LineAgent(0.4)}, 60, out=run, progress=False)
+    success = {arm: np.array([r["metrics"]["success"] for r in log.episodes if r["arm"] == arm]) for arm in log.arms}
+    pilot = read_pilot(log, "mine", "warp")
+    assert pilot.base == pytest.approx(100 * success["warp"].mean())
+    assert pilot.losses == pytest.approx(100 * np.mean(success["warp"] > success["mine"])) and pilot.per_scene == 2
+    assert read_pilot(log, "warp", "mine").losses == pilot.losses, "the better arm's, whichever is the base"
+    assert main(["power", "15", "--pilot", str(run), "--pilot-arms", "mine,warp"]) == 0
+    said = capsys.readouterr().out
+    assert "pilot: mine and warp, 60 episodes" in said
+    assert str(wiw.power(15, **pilot.settings())) in said
+    for flags, message in (
+        (["--pilot", str(run)], "--pilot RUN with --pilot-arms ARM,BASE"),
+        (["--pilot", str(run), "--pilot-arms", "mine"], "expected --pilot-arms ARM,BASE, got 'mine'"),
+        (["--pilot", str(run), "--pilot-arms", "mine,oracle"], "no arm 'oracle'"),
+        (["--task", "chess"], "no pilot of task 'chess'; there are imagenav"),
+    ):
+        assert main(["power", "15", *flags]) == 2 and message in " ".join(capsys.readouterr().err.split())
+
+
+def test_the_correlation_of_a_pilot_is_that_of_its_scenes():
+    rng = np.random.default_rng(1)
+    for correlation in (0.0, 0.3):
+        (counts,) = draw_outcome_counts([0.3, 0.1, 0.6], [6] * 3000, correlation, 1, rng)
+        values = np.concatenate([np.repeat([1.0, -1.0, 0.0], ways) for ways in counts])
+        found = estimate_correlation(values, np.repeat(np.arange(3000), 6))
+        assert found == pytest.approx(correlation, abs=0.03)
+    assert estimate_correlation(np.ones(4), np.arange(4)) == 0
+
+
+def test_two_models_five_points_apart_on_each_task(capsys):
+    assert main(["power", "5", "--task", "all"]) == 0
+    shown = capsys.readouterr().out
+    assert all(task in shown for task in PILOTS)
+    assert main(["power", "5", "--task", "imagenav"]) == 0
+    shown = capsys.readouterr().out
+    assert str(wiw.power(5, **PILOTS["imagenav"].settings())) in shown

@@ -3,16 +3,22 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from typing import TYPE_CHECKING, Annotated
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any
 
 from tyro.conf import Positional, arg
 
 if TYPE_CHECKING:
+    from wiw.analysis.pilot import Pilot
     from wiw.analysis.power import Power
 
 Number = Annotated[float, arg(metavar="X")]
 Count = Annotated[int, arg(metavar="N")]
+MaybeNumber = Annotated[float | None, arg(metavar="X")]
+MaybeCount = Annotated[int | None, arg(metavar="N")]
+BASE, LOSSES = 20.0, 2.0
+"""As in `wiw.analysis.power`, which takes a second to load."""
 USUAL = (5.0, 10.0, 15.0, 20.0, 30.0)
 
 
@@ -21,10 +27,13 @@ def power(
     /,
     *,
     scenes: Annotated[int | None, arg(metavar="N")] = None,
-    base: Number = 20.0,
-    losses: Number = 2.0,
-    correlation: Number = 0.05,
-    per_scene: Count = 5,
+    task: Annotated[str | None, arg(metavar="TASK|all")] = None,
+    pilot: Annotated[Path | None, arg(metavar="RUN")] = None,
+    pilot_arms: Annotated[str | None, arg(metavar="ARM,BASE")] = None,
+    base: MaybeNumber = None,
+    losses: MaybeNumber = None,
+    correlation: MaybeNumber = None,
+    per_scene: MaybeCount = None,
     chance: Number = 0.8,
     arms: Count = 1,
 ) -> int:
@@ -35,41 +44,82 @@ def power(
       $ wiw power 10 --arms 4            # as one of four arms compared with the same base
       $ wiw power -5 --base 50         # an arm that is 5 points worse
       $ wiw power --scenes 40            # the least difference that 40 scenes of 5 episodes can show
+      $ wiw power 5 --task all           # two models 5 points apart, on each task as it was measured
+      $ wiw power 5 --pilot runs/first --pilot-arms mine,warp  # as two arms of a run of your own differ
 
     Arms are compared on the same episodes, so only episodes count in which one succeeds and the other fails: won or
     lost. 30 % won and 20 % lost give the same difference as 12 % won and 2 % lost, but far weaker evidence, so --losses
     matters as much as the difference. Scenes count more than episodes: with a correlation above 0, more episodes of
     the same scenes soon stop helping.
 
-    The defaults are near what 210 episodes in 42 generated apartments gave: 18 % without a world model; with the
-    oracle 36 % won and 2 % lost; differences correlate within an apartment by -0.06 to 0.06.
+    Without --task or --pilot, numbers are near what 210 episodes in 42 generated apartments gave: 18 % without a world
+    model; with the oracle 36 % won and 2 % lost; differences correlate within an apartment by -0.06 to 0.06.
 
     Args:
         difference: Percentage points of success rate; a table of usual values if neither it nor --scenes is given.
         scenes: Number of scenes; computes the smallest difference that they can show.
-        base: Success rate of the arm compared with, percent.
-        losses: Percent of episodes that the better arm loses.
-        correlation: Correlation between the differences of two episodes of a scene.
-        per_scene: Episodes in each scene.
+        task: Take what is not given below from two arms of this task in docs/results.md; all: one line per task.
+        pilot: Take it from two arms of this run.
+        pilot_arms: Which arms of --pilot; the second is the base.
+        base: Success rate of the arm compared with, percent; 20 if nothing says otherwise.
+        losses: Percent of episodes that the better arm loses; 2 if nothing says otherwise.
+        correlation: Correlation between the differences of two episodes of a scene; 0.05 if nothing says otherwise.
+        per_scene: Episodes in each scene; 5 if nothing says otherwise.
         chance: Power: the probability of showing the difference if there is one.
         arms: Number of arms compared with the same base; their p values are Holm-adjusted.
     """
     from wiw.analysis.power import power as plan
 
-    def plan_power(points: float | None, scenes: int | None = None) -> Power:
-        return plan(
-            points, scenes=scenes, base=base, losses=losses, correlation=correlation, per_scene=per_scene,
-            chance=chance, arms=arms,
-        )  # fmt: skip
+    given = {"base": base, "losses": losses, "correlation": correlation, "per_scene": per_scene}
+    own = {name: value for name, value in given.items() if value is not None}
+    pilots = _find_pilots(task, pilot, pilot_arms)
 
-    if difference is not None or scenes is not None:
-        print(plan_power(difference, scenes))
+    def plan_power(points: float | None, settings: Mapping[str, Any]) -> Power:
+        return plan(points, scenes=scenes, chance=chance, arms=arms, **{**settings, **own})
+
+    if task == "all":
+        points = difference if difference is not None or scenes is not None else 5.0
+        _print_table([plan_power(points, one.settings()) for one in pilots.values()], chance, list(pilots))
         return 0
-    _table([plan_power(points) for points in USUAL if base + points + losses <= 100], chance)
+    (found,) = pilots.values() or (None,)
+    settings = {} if found is None else found.settings()
+    if found is not None:
+        print(f"pilot: {found.source}")
+    if difference is not None or scenes is not None:
+        print(plan_power(difference, settings))
+        return 0
+    usual = {"base": BASE, "losses": LOSSES, **settings, **own}
+    fitting = [points for points in USUAL if usual["base"] + points + usual["losses"] <= 100]
+    _print_table([plan_power(points, settings) for points in fitting], chance)
     return 0
 
 
-def _table(plans: Sequence[Power], chance: float) -> None:
+def _find_pilots(task: str | None, run: Path | None, arms: str | None) -> dict[str, Pilot]:
+    """Return pilots by task: none, one, or one for each task.
+
+    Raises:
+        ArgumentError: options that do not go together, or a pilot that is not there.
+        StoreError: a run that cannot be read.
+    """
+    from wiw.analysis.pilot import PILOTS, find_pilot, read_pilot
+    from wiw.errors import ArgumentError
+    from wiw.runs.run import Run
+    from wiw.runs.store import RunStore
+
+    if (run is None) != (arms is None) or (run is not None and task is not None):
+        raise ArgumentError("power: expected --pilot RUN with --pilot-arms ARM,BASE, or --task, or neither")
+    if run is not None and arms is not None:
+        names = [name.strip() for name in arms.split(",")]
+        if len(names) != 2:
+            raise ArgumentError(f"power: expected --pilot-arms ARM,BASE, got '{arms}'")
+        with RunStore.read(run) as store:
+            return {"run": read_pilot(Run(store), *names)}
+    if task == "all":
+        return dict(PILOTS)
+    return {} if task is None else {task: find_pilot(task)}
+
+
+def _print_table(plans: Sequence[Power], chance: float, tasks: Sequence[str] = ()) -> None:
     from rich import box
     from rich.console import Console
     from rich.table import Table
@@ -79,10 +129,13 @@ def _table(plans: Sequence[Power], chance: float) -> None:
         title_justify="left",
         box=box.SIMPLE_HEAD,
     )
-    for column in ("points", "won/lost %", "scenes", "episodes", "by interval %", "by test %"):
+    if tasks:
+        table.add_column("task", no_wrap=True)
+    for column in ("points", "won/lost %", "scenes", "episodes", "interval %", "test %"):
         table.add_column(column, justify="right")
-    for one in plans:
+    for index, one in enumerate(plans):
         table.add_row(
+            *tasks[index : index + 1],
             f"{one.difference:+g}",
             f"{one.wins:g}/{one.losses:g}",
             str(one.scenes),
