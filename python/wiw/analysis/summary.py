@@ -24,10 +24,11 @@ from wiw.analysis.marks import BLIND, Marks, answer_blind, read_marks
 from wiw.analysis.statistics import LEVEL, Difference, Estimate, adjust_p_values, compare, estimate_mean
 from wiw.analysis.utility import CEILING, FLOOR, Utility, utility
 from wiw.errors import RegistryError
-from wiw.metrics.metric import ANSWER_SCORE, SPL, SPL_RULE, Metric
+from wiw.metrics.metric import ANSWER_SCORE, SPL, SPL_RULE, SUCCESS, Metric
 from wiw.registry import METRICS
 from wiw.runs.departures import Departure, read_departures
 from wiw.runs.judges import JudgeRecord
+from wiw.runs.recipes import RESEEDED
 from wiw.runs.run import Records, Run
 from wiw.scenes import strip_edits
 from wiw.types import TableSpec
@@ -44,6 +45,8 @@ PLACEBOS = {
     "placebo-blind": "control: same compute, the model is told no plan",
 }
 """Arms with the compute of a world model and uninformative imagination; ":" and a model's name may follow."""
+REPEATS = {RESEEDED: "noise floor: the same with other random numbers"}
+"""Arms that repeat another one of the run; ":" and a model's name follow."""
 GAINS = {
     "none": "Gain over the policy without a world model",
     "copy": "Gain over the floor, which predicts that nothing changes",
@@ -126,6 +129,8 @@ class Summary:
     """Trackers of targets in imagined frames by name, each with "frames" or "poses", whichever it followed."""
     looks: str = field(default="", kw_only=True)
     """Sentences on the rule by which the run was to stop early, and on whether it did; empty without one."""
+    noise: tuple[Difference, ...] = field(default=(), kw_only=True)
+    """Each arm that repeats another, minus that one."""
     departures: tuple[Departure, ...] = field(default=(), kw_only=True)
     """Where the run departs from the paper's protocol."""
 
@@ -277,6 +282,37 @@ def summarise_run(run: Run) -> Summary:
         trackers=_list_trackers(run),
         departures=departures,
         looks=_describe_looks(run.store.info),
+        noise=measure_noise(run),
+    )
+
+
+def measure_noise(run: Run) -> tuple[Difference, ...]:
+    """Return how each arm that repeats another one of the run with other random numbers differs from that one in SR."""
+    agents = {arm["name"]: dict(arm["agent"]) for arm in run.store.config["arms"]}
+    repeats = {name: agent.pop("reseed", None) for name, agent in agents.items()}
+    pairs = [
+        (arm, other)
+        for arm in agents
+        for other in agents
+        if repeats[arm] is not None and repeats[other] is None and agents[arm] == agents[other]
+    ]
+    if not pairs:
+        return ()
+    done, _ = split_outcomes(run.arms, run.store.outcomes())
+    found = [compare(arm, other, done, SUCCESS, run.store.config["seed"]) for arm, other in pairs]
+    return tuple(one for one in found if one is not None)
+
+
+def _describe_noise(found: Difference) -> str:
+    """Return how much an arm differs from itself, in a sentence or two."""
+    estimate, differing = found.estimate, found.wins + found.losses
+    if not differing:
+        same = f"Noise floor: with other random numbers {found.base} succeeds in the same {estimate.n} episodes."
+        return f"{same} What policy and model draw makes no difference here."
+    return (
+        f"Noise floor: with other random numbers {found.base} differs from itself in {differing} of {estimate.n} "
+        f"episodes ({found.wins} won, {found.losses} lost), SR by {show_estimate(estimate, signed=True)} points. A "
+        "difference between arms that is no larger may be the draw's."
     )
 
 
@@ -353,8 +389,9 @@ def role_of(arm: str, policies: Collection[str] = ()) -> str:
     """Return the role of an arm, from its name; `policies` are the arms without a world model."""
     if arm in ROLES:
         return ROLES[arm]
-    placebo = PLACEBOS.get(arm.rpartition("+")[2].partition(":")[0])
-    return placebo or (ANOTHER_POLICY if arm in policies else WORLD_MODEL)
+    kind = arm.rpartition("+")[2].partition(":")[0]
+    special = {**PLACEBOS, **REPEATS}.get(RESEEDED if kind.startswith(f"{RESEEDED}-") else kind)
+    return special or (ANOTHER_POLICY if arm in policies else WORLD_MODEL)
 
 
 def _differences_from(
@@ -453,6 +490,7 @@ def notes(summary: Summary) -> list[str]:
     found += _explain_partial(summary)
     found += [SPL_RULE] if summary.marks is None and SPL.name in {each.name for each in list_columns(summary)} else []
     found += [_explain_paper_name(metric) for metric in list_columns(summary) if metric.paper_name]
+    found += [_describe_noise(one) for one in summary.noise]
     found += [summary.looks] if summary.looks else []
     found += summary.remarks()
     widest = max(

@@ -34,6 +34,7 @@ def run(
     *,
     parts: Annotated[AgentFlags, arg(name="")] = AGENT,
     arms: Annotated[str | None, arg(metavar="[NAME=]MODEL[?KEY=VALUE],...")] = None,
+    noise_floor: bool = False,
     rules: Annotated[TaskFlags, arg(name="")] = TASK,
     report: bool = True,
     dry_run: bool = False,
@@ -51,6 +52,7 @@ def run(
     $ wiw run ar --policy vlm --vlm http://localhost:8000/v1 --world-model warp
     $ wiw run manipulation --tasks push_buttons,stack_cups --episodes 40 --arms none,copy,oracle
     $ wiw run ar --preset official --policy vlm --world-model svd --dry-run
+    $ wiw run imagenav --arms none,warp --episodes 400 --until "warp-none excludes 0"
     $ wiw run imagenav --arms none,warp --episodes 400 --shard 3/8 --out runs/a/3 --resume
 
     Ctrl-C (exit code 130) or SIGTERM (75, within 5 seconds) stops a run without loss; `wiw resume` continues it.
@@ -63,6 +65,8 @@ def run(
             other plans, or from elsewhere; placebo-blind asks a text model with an empty prompt; placebo-shuffled:MODEL
             names another. NAME=MODEL?KEY=VALUE names an arm and gives its model options, several with & between them
             (in quotes), besides those of --world-model-option.
+        noise_floor: Also run the arm of --world-model, or the last of --arms, once more with other random numbers
+            (reseeded:MODEL, which --arms takes too): the report says how much it differs from itself.
         rules: What it is run on.
         report: Whether to write report.html at the end; none of a shard.
         dry_run: Whether to run nothing, and print what the preset sets and where the run would depart from the paper.
@@ -71,6 +75,7 @@ def run(
     """
     from wiw.cli.announcement import announce_protocol
 
+    arms = add_noise_floor(arms, parts.world_model) if noise_floor else arms
     made = prepare_run(task, parts, arms, rules, search, config)
     if dry_run:
         announce_protocol(made.built, made.recipes, made.count)
@@ -80,6 +85,19 @@ def run(
     folder = Path(made.settings.out or "")
     work = lambda: evaluate(made.task, made.agent, arms=made.arms, config=made.settings)  # noqa: E731
     return finish(stoppable(work, folder), report)
+
+
+def add_noise_floor(arms: str | None, world_model: str) -> str:
+    """Return the text of the arms with one more, which repeats the arm of the world model, or the last one."""
+    from wiw.runs.arm_text import parse_arm, split_arms
+    from wiw.runs.recipes import RESEEDED
+
+    texts = [world_model] if arms is None else split_arms(arms)
+    repeated = parse_arm(world_model if world_model != "none" else texts[-1])
+    policy, plus, model = repeated.model.rpartition("+")
+    name = "" if repeated.name is None else f"{RESEEDED}-{repeated.name}="
+    again = replace(repeated, name=None, model=f"{policy}{plus}{RESEEDED}:{model}")
+    return ",".join([*texts, f"{name}{again}"])
 
 
 @dataclass(frozen=True)

@@ -32,6 +32,8 @@ from wiw.world_models.base import WorldModel
 
 PLACEBO, PLACEBO_MODEL = "placebo-", "warp"
 """What arms of placebos begin with, and the model that they are of where nobody names one."""
+RESEEDED = "reseeded"
+"""Begins arms that repeat another with other random numbers: the noise floor."""
 REFERENCES = ("none", "copy", "oracle")
 """Arms that reports know by name: no world model, floor and ceiling."""
 ELSEWHERE = ("vlm", "cache", "prices", "concurrency", "timeout", "attempts")
@@ -94,6 +96,8 @@ class AgentRecipe(AgentConfig):
     """Options of the tracker."""
     observers: Sequence[Observer] = ()
     """Measure decisions; objects in memory."""
+    reseed: int | None = None
+    """Number that is mixed into the run's seed for all that policy and model draw; None: the run's seed as it is."""
 
     def build(self, context: RunContext, limits: Limits = NO_LIMITS) -> Agent:
         """Return the agent; numbers that are open are the task's."""
@@ -324,6 +328,7 @@ class AgentInMemory:
     """An agent of another method than `wiw.Agent`'s; like a task in memory."""
 
     agent: BaseAgent
+    reseed: None = None
 
     def build(self, context: RunContext, limits: Limits = NO_LIMITS) -> BaseAgent:
         """Return the agent itself."""
@@ -432,16 +437,17 @@ def _make_arm(agent: AgentRecipe, name: str | None, model: Any) -> tuple[str, Ag
     if name is not None and arm.name is not None:
         raise ArgumentError(f"arms: '{model}' has the names '{name}' and '{arm.name}'; expected one of them")
     policy, of_model = _split_policy(arm.model)
-    kind, named = placebo_of(of_model)
+    repeats, of_model = _split_repeat(of_model)
+    kind, named = placebo_of(of_model or "")
     own = agent if policy is None else agent.with_policy(policy)
-    changed = own.with_model(of_model) if kind is None else own.as_placebo(kind, named)
-    changed = _with_options(changed, arm)
+    changed = own.as_placebo(kind, named) if kind is not None else own if of_model is None else own.with_model(of_model)
+    changed = _with_options(replace(changed, reseed=1) if repeats else changed, arm)
     given = arm.name if name is None else name
-    if given in REFERENCES and (changed.arm != given or kind is not None):
+    if given in REFERENCES and (changed.arm != given or kind is not None or repeats):
         raise ArgumentError(
             f"arms: reports take the arm '{given}' for the reference '{given}', got {arm.model}; choose another name"
         )
-    return given or _name_arm(policy, of_model), changed
+    return given or _name_arm(policy, changed.arm if of_model is None else of_model, repeats), changed
 
 
 def _with_options(agent: AgentRecipe, arm: ArmText) -> AgentRecipe:
@@ -465,18 +471,28 @@ def make_arm_absolute(text: str) -> str:
     return str(replace(arm, model=f"{f'{policy}+' if policy else ''}{absolute(model)}"))
 
 
+def _split_repeat(model: str) -> tuple[bool, str | None]:
+    """Return whether an arm repeats another with other random numbers, and the model; None for the agent's own."""
+    if model == RESEEDED:
+        return True, None
+    repeats = model.startswith(f"{RESEEDED}:")
+    return repeats, model.removeprefix(f"{RESEEDED}:") if repeats else model
+
+
 def _split_policy(name: str) -> tuple[str | None, str]:
     """Return policy (None: the agent's own) and world model of "oracle" or "heuristic+oracle"."""
     policy, plus, model = name.partition("+")
     return (policy, model) if plus and policy in POLICIES.names() else (None, name)
 
 
-def _name_arm(policy: str | None, model: str) -> str:
+def _name_arm(policy: str | None, model: str, repeats: bool) -> str:
     kind, named = placebo_of(model)
     short = AgentRecipe("", None if named in ("none", None) else named).arm
     if kind is not None:
         short = f"{PLACEBO}{kind}{f':{short}' if named else ''}"
-    return short if policy is None else policy if model == "none" else f"{policy}+{short}"
+    if repeats:
+        short = f"{RESEEDED}:{short}"
+    return short if policy is None else policy if model == "none" and not repeats else f"{policy}+{short}"
 
 
 def placebo_of(arm: str) -> tuple[str | None, str | None]:
@@ -496,6 +512,9 @@ def placebo_of(arm: str) -> tuple[str | None, str | None]:
 
 def absolute(model: str) -> str:
     """`path.py:Class` with its path made absolute, so that it means the same in any folder; other names as they are."""
+    repeats, named = _split_repeat(model)
+    if repeats:
+        return model if named is None else f"{RESEEDED}:{absolute(named)}"
     kind, named = placebo_of(model)
     if kind is not None and named is not None:
         return f"{PLACEBO}{kind}:{absolute(named)}"

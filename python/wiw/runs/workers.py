@@ -20,6 +20,7 @@ from multiprocessing import get_context
 from multiprocessing.connection import Connection, wait
 from typing import Any, Protocol
 
+from wiw._core import core
 from wiw.errors import Error, InfrastructureError
 from wiw.loop.limits import Limits
 from wiw.runs.compose import RunContext
@@ -30,6 +31,8 @@ from wiw.types import DecisionRecord, Episode, EpisodeResult
 Row = RestartRow | AgentRow | DecisionRow | LostRow | OutcomeRow
 
 
+_RESEED = 0x52455345
+"""Keeps the seeds of arms that repeat another apart from all other draws."""
 TRIES = 2
 """How often an episode is begun whose worker dies."""
 NUMBERS = {2: "twice", 3: "three times"}
@@ -124,11 +127,16 @@ class Runner:
             self._task,
             self._agent,
             job.episodes,
-            seed=self._spec.seed,
+            seed=mix_seed(self._spec.seed, self._spec.agents[job.arm].reseed),
             live=self._spec.live,
             sink=sink,
             pictured=self._spec.pictures,
         )
+
+
+def mix_seed(seed: int, reseed: int | None) -> int:
+    """Return the seed of an arm's decisions: the run's, or another one for an arm that repeats one."""
+    return seed if reseed is None else int(core.fold_key([seed, reseed, _RESEED]))
 
 
 def run_here(spec: WorkerSpec, jobs: Iterable[Job], receiver: ReportReceiver) -> None:
