@@ -43,6 +43,9 @@ PLACEBOS = {
     "placebo-blind": "control: same compute, the model is told no plan",
 }
 """Arms with the compute of a world model and uninformative imagination; ":" and a model's name may follow."""
+ERROR = "error-"
+"""What the names of arms begin with whose futures have an error of a known dose."""
+ERRONEOUS = "control: futures with an error of a known dose"
 GAINS = {
     "none": "Gain over the policy without a world model",
     "copy": "Gain over the floor, which predicts that nothing changes",
@@ -329,8 +332,10 @@ def role_of(arm: str, policies: Collection[str] = ()) -> str:
     """Return the role of an arm, from its name; `policies` are the arms without a world model."""
     if arm in ROLES:
         return ROLES[arm]
-    placebo = PLACEBOS.get(arm.rpartition("+")[2].partition(":")[0])
-    return placebo or (ANOTHER_POLICY if arm in policies else WORLD_MODEL)
+    model = arm.rpartition("+")[2].partition(":")[0]
+    if model.startswith(ERROR):
+        return ERRONEOUS
+    return PLACEBOS.get(model) or (ANOTHER_POLICY if arm in policies else WORLD_MODEL)
 
 
 def _differences_from(

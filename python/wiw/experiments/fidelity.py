@@ -21,6 +21,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from wiw._core import core
+from wiw.errors import ArgumentError
 from wiw.loop.attempts import Attempted
 from wiw.loop.clock import Clock
 from wiw.loop.contract import check_scores
@@ -35,6 +37,8 @@ from wiw.types import Decision, Fidelity, Key, Rollout
 
 PERSPECTIVE = (256, 256)
 """Size of the views that LPIPS is taken of."""
+_MEASURE = 0x66696465
+"""Keeps the draw whether to measure apart from all others of the decision."""
 
 
 class FidelityObserver(Observer, Privileged):
@@ -42,13 +46,18 @@ class FidelityObserver(Observer, Privileged):
 
     Args:
         lpips: folder of the weights of LPIPS ("auto": `~/.cache/wiw/weights`), to measure fidelity by it as well.
+        share: of the decisions that are measured, above 0 to 1, drawn by their keys: what a smaller share measures, a
+            larger one does too.
 
     Raises:
         WeightsError: those of LPIPS are not there.
+        ArgumentError: a share out of range.
     """
 
-    def __init__(self, lpips: str | Path | None = None) -> None:
-        self._lpips = None if lpips is None else Lpips(lpips)
+    def __init__(self, lpips: str | Path | None = None, share: float = 1.0) -> None:
+        if not 0 < share <= 1:
+            raise ArgumentError(f"fidelity: expected a share above 0 and up to 1, got {share}")
+        self._lpips, self._share = None if lpips is None else Lpips(lpips), share
         self._environments = LiveEnvironments()
         self._seen: dict[Key, _Truth] = {}
 
@@ -59,9 +68,13 @@ class FidelityObserver(Observer, Privileged):
     def watch(self, batch: ScoringBatch) -> None:
         """Replay the plans in the simulator, and score the true rollouts with copies of the reviser's memories."""
         with batch.clock("replay"):
-            places = [place for place, own in enumerate(batch.imagined.rollouts) if own is not None]
+            pairs = enumerate(zip(batch.queries, batch.imagined.rollouts, strict=True))
+            places = [place for place, (query, own) in pairs if own is not None and self._is_measured(query.key)]
             if places:
                 self._seen |= _replay(self._environments, batch, places, self._lpips)
+
+    def _is_measured(self, key: Key) -> bool:
+        return bool(core.uniform(core.fold_key([key.seed, key.episode, key.decision, _MEASURE]), 1)[0] < self._share)
 
     def annotate(self, decision: Decision) -> Decision:
         """Add the fidelity of a decision's imagination."""
@@ -76,6 +89,7 @@ class _Truth:
     rollouts: Sequence[Rollout]
     scores: NDArray[np.float64]
     distances: NDArray[np.float64] | None
+    pose_errors: NDArray[np.float64] | None
 
 
 def _replay(
@@ -106,8 +120,10 @@ def _replay(
         view = FrameSpec("front" if batch.imagined.view == "perspective" else "surround", PERSPECTIVE)
         shown, truths = batch.imagined.show(view), true.show(view)
         distances = _distances(lpips, [shown[place] for place in places], truths)
-    found = zip(queries, rollouts, scores, distances, strict=True)
-    return {query.key: _Truth(own, score, distance) for query, own, score, distance in found}
+    known = batch.imagined.pose_errors
+    misplaced = [None if known is None else known[place] for place in places]
+    found = zip(queries, rollouts, scores, distances, misplaced, strict=True)
+    return {query.key: _Truth(*measured) for query, *measured in found}
 
 
 def _copy_memory(situation: Situation) -> Situation:
@@ -122,7 +138,13 @@ def _compare(imagined: Sequence[Rollout], scores: NDArray[np.float64], truth: _T
     errors = np.array([_errors(one, other) for one, other in zip(imagined, truth.rollouts, strict=True)])
     agreement = rank_agreement(scores, truth.scores)
     return Fidelity(
-        tuple(truth.rollouts), truth.scores, agreement, psnr=errors[:, 0], ssim=errors[:, 1], lpips=truth.distances
+        tuple(truth.rollouts),
+        truth.scores,
+        agreement,
+        psnr=errors[:, 0],
+        ssim=errors[:, 1],
+        lpips=truth.distances,
+        pose_errors=truth.pose_errors,
     )
 
 

@@ -12,6 +12,8 @@ from typing import Any, cast
 from wiw.envs.base import Env
 from wiw.errors import ArgumentError
 from wiw.experiments.counterparts import is_counterpart
+from wiw.experiments.errors import make_error
+from wiw.experiments.errors.erroneous import require_error
 from wiw.experiments.placebos import PLACEBOS, require_words
 from wiw.loop.agent import Agent
 from wiw.loop.agent_spec import AgentSpec, space_option
@@ -32,6 +34,8 @@ from wiw.world_models.base import WorldModel
 
 PLACEBO, PLACEBO_MODEL = "placebo-", "warp"
 """What arms of placebos begin with, and the model that they are of where nobody names one."""
+ERROR, ERROR_MODEL = "error-", "oracle"
+"""What arms with an error begin with, and the model that they are of where nobody names one."""
 REFERENCES = ("none", "copy", "oracle")
 """Arms that reports know by name: no world model, floor and ceiling."""
 ELSEWHERE = ("vlm", "cache", "prices", "concurrency", "timeout", "attempts")
@@ -78,6 +82,8 @@ class AgentRecipe(AgentConfig):
     model: Any = None
     reviser: Any = None
     placebo: str | None = None
+    error: str | None = None
+    """KIND@DOSE of an error that the world model's futures have (`wiw.experiments.errors`)."""
     imagine_fraction: float | None = None
     model_options: Mapping[str, Any] = field(default_factory=dict)
     """What the world model is made with, by name."""
@@ -105,7 +111,7 @@ class AgentRecipe(AgentConfig):
         if semantics is not None and self.semantics_options:
             semantics = SEMANTICS.make(self.semantics, **self.semantics_options)
         policy, reviser = self._make_policies(space, context.task)
-        experiment = Experiment(self.placebo, self.imagine_fraction, tuple(self.ground_truth), semantics)
+        experiment = Experiment(self.placebo, self.imagine_fraction, tuple(self.ground_truth), semantics, self.error)
         return compose(
             AgentSpec(policy, model, reviser, self.config, tuple(self.observers)), experiment, limits, context
         )
@@ -141,6 +147,10 @@ class AgentRecipe(AgentConfig):
         """Return the same agent with a placebo of its world model (or of another one)."""
         own = PLACEBO_MODEL if self.model is None else self.model
         return replace(self.with_model(own if model is None else model), placebo=kind)
+
+    def with_error(self, error: str, model: Any = None) -> AgentRecipe:
+        """Return the same agent whose world model is the oracle (or another one) with an error."""
+        return replace(self.with_model(ERROR_MODEL if model is None else model), error=error)
 
     @property
     def is_named(self) -> bool:
@@ -211,6 +221,8 @@ class AgentRecipe(AgentConfig):
             require_placebo(self.placebo, self._find_space(task), episodes)
         if self.placebo == "blind" and (control := find_control(self.model)):
             require_words(control)
+        if self.error is not None:
+            require_error(make_error(self.error), self._find_space(task), _has_simulator(self.model))
         parts = ((WORLD_MODELS, self.model), (POLICIES, self.policy), (POLICIES, self.reviser))
         for registry, part in parts:
             found = registry.find(part) if isinstance(part, str) else part
@@ -292,6 +304,12 @@ def find_control(model: Any) -> str:
     """Return how a world model, or one of that name, is told plans; empty where only the model itself can say."""
     found = WORLD_MODELS.find(model) if isinstance(model, str) else model
     return str(getattr(getattr(found, "accepts", None), "control", ""))
+
+
+def _has_simulator(model: Any) -> bool:
+    """Return whether a world model, or one of that name, is handed the simulator; of the built-in ones the oracle is."""
+    found = WORLD_MODELS.find(model) if isinstance(model, str) else model
+    return model == ERROR_MODEL or "simulator" in getattr(getattr(found, "accepts", None), "needs", ())
 
 
 def _describe(part: Any) -> Any:
@@ -432,16 +450,24 @@ def _make_arm(agent: AgentRecipe, name: str | None, model: Any) -> tuple[str, Ag
     if name is not None and arm.name is not None:
         raise ArgumentError(f"arms: '{model}' has the names '{name}' and '{arm.name}'; expected one of them")
     policy, of_model = _split_policy(arm.model)
-    kind, named = placebo_of(of_model)
     own = agent if policy is None else agent.with_policy(policy)
-    changed = own.with_model(of_model) if kind is None else own.as_placebo(kind, named)
-    changed = _with_options(changed, arm)
+    changed = _with_options(_change_model(own, of_model), arm)
     given = arm.name if name is None else name
-    if given in REFERENCES and (changed.arm != given or kind is not None):
+    is_changed = changed.placebo is not None or changed.error is not None
+    if given in REFERENCES and (changed.arm != given or is_changed):
         raise ArgumentError(
             f"arms: reports take the arm '{given}' for the reference '{given}', got {arm.model}; choose another name"
         )
     return given or _name_arm(policy, of_model), changed
+
+
+def _change_model(agent: AgentRecipe, text: str) -> AgentRecipe:
+    """Return the agent with the world model of an arm, or with a placebo or an error of it."""
+    kind, named = placebo_of(text)
+    if kind is not None:
+        return agent.as_placebo(kind, named)
+    error, named = error_of(text)
+    return agent.with_model(text) if error is None else agent.with_error(error, named)
 
 
 def _with_options(agent: AgentRecipe, arm: ArmText) -> AgentRecipe:
@@ -473,9 +499,10 @@ def _split_policy(name: str) -> tuple[str | None, str]:
 
 def _name_arm(policy: str | None, model: str) -> str:
     kind, named = placebo_of(model)
+    error, named = (None, named) if kind is not None else error_of(model)
     short = AgentRecipe("", None if named in ("none", None) else named).arm
-    if kind is not None:
-        short = f"{PLACEBO}{kind}{f':{short}' if named else ''}"
+    if kind is not None or error is not None:
+        short = f"{f'{ERROR}{error}' if kind is None else f'{PLACEBO}{kind}'}{f':{short}' if named else ''}"
     return short if policy is None else policy if model == "none" else f"{policy}+{short}"
 
 
@@ -494,10 +521,27 @@ def placebo_of(arm: str) -> tuple[str | None, str | None]:
     return kind, model or None
 
 
+def error_of(arm: str) -> tuple[str | None, str | None]:
+    """Return error and model of "error-blur@16:warp"; no model where it names none, no error for another arm.
+
+    Raises:
+        ArgumentError: an unknown kind of error, or a dose out of range.
+    """
+    if not arm.startswith(ERROR):
+        return None, arm
+    text, _, model = arm.removeprefix(ERROR).partition(":")
+    if model == "none":
+        raise ArgumentError(f"arms: expected {ERROR}KIND@DOSE[:MODEL], of a world model, got '{arm}'")
+    return str(make_error(text)), model or None
+
+
 def absolute(model: str) -> str:
     """`path.py:Class` with its path made absolute, so that it means the same in any folder; other names as they are."""
     kind, named = placebo_of(model)
     if kind is not None and named is not None:
         return f"{PLACEBO}{kind}:{absolute(named)}"
+    error, named = error_of(model)
+    if error is not None:
+        return f"{ERROR}{error}{f':{absolute(named)}' if named else ''}"
     path, colon, name = model.rpartition(":")
     return f"{Path(path).expanduser().resolve()}:{name}" if colon and path.endswith(".py") else model

@@ -201,7 +201,7 @@ def _take_over(store: RunStore, settings: RunConfig) -> None:
     begun_with, now = Limits(**store.info["limits"]).to_json(), settings.to_json()
     begun_with["shard"], now["shard"] = store.info.get("shard"), settings.shard
     try:
-        names = ("fidelity", "lpips", "shard")
+        names = ("fidelity", "fidelity_share", "lpips", "shard")
         store.require_same(*({name: each[name] for name in names} for each in (begun_with, now)))
     except StoreError:
         store.close()
