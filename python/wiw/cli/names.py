@@ -10,7 +10,9 @@ from typing import Any, Literal
 from rich.markup import escape
 from tyro.conf import Positional
 
-What = Literal["all", "world-models", "policies", "trackers", "tasks", "presets", "metrics", "errors", "vlm-models", "prompts"]
+What = Literal[
+    "all", "world-models", "policies", "trackers", "tasks", "presets", "metrics", "errors", "vlm-models", "prompts"
+]
 
 
 def list_names(what: Positional[What] = "all", /) -> int:

@@ -62,8 +62,8 @@ def run(
             them if it is not among them. placebo-shuffled and placebo-swapped let it (or warp) imagine as much, but
             other plans, or from elsewhere; placebo-blind asks a text model with an empty prompt; placebo-shuffled:MODEL
             names another. error-KIND@DOSE lets the futures of the oracle have an error, as error-blur@16 (`wiw list
-            errors`), error-blur@16:MODEL those of another model. NAME=MODEL?KEY=VALUE names an arm and gives its model options, several with & between them
-            (in quotes), besides those of --world-model-option.
+            errors`), error-blur@16:MODEL those of another model. NAME=MODEL?KEY=VALUE names an arm and gives its model
+            options, several with & between them (in quotes), besides those of --world-model-option.
         rules: What it is run on.
         report: Whether to write report.html at the end; none of a shard.
         dry_run: Whether to run nothing, and print what the preset sets and where the run would depart from the paper.

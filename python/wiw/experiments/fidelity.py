@@ -34,6 +34,7 @@ from wiw.metrics import Lpips, psnr, rank_agreement, ssim
 from wiw.policies.base import FrameSpec, Situation
 from wiw.registry import WORLD_MODELS
 from wiw.types import Decision, Fidelity, Key, Rollout
+from wiw.world_models.base import WorldModel
 
 PERSPECTIVE = (256, 256)
 """Size of the views that LPIPS is taken of."""
@@ -48,16 +49,17 @@ class FidelityObserver(Observer, Privileged):
         lpips: folder of the weights of LPIPS ("auto": `~/.cache/wiw/weights`), to measure fidelity by it as well.
         share: of the decisions that are measured, above 0 to 1, drawn by their keys: what a smaller share measures, a
             larger one does too.
+        oracle: which the plans are replayed in; one of the usual size where None.
 
     Raises:
         WeightsError: those of LPIPS are not there.
         ArgumentError: a share out of range.
     """
 
-    def __init__(self, lpips: str | Path | None = None, share: float = 1.0) -> None:
+    def __init__(self, lpips: str | Path | None = None, share: float = 1.0, oracle: WorldModel | None = None) -> None:
         if not 0 < share <= 1:
             raise ArgumentError(f"fidelity: expected a share above 0 and up to 1, got {share}")
-        self._lpips, self._share = None if lpips is None else Lpips(lpips), share
+        self._lpips, self._share, self._oracle = None if lpips is None else Lpips(lpips), share, oracle
         self._environments = LiveEnvironments()
         self._seen: dict[Key, _Truth] = {}
 
@@ -71,7 +73,8 @@ class FidelityObserver(Observer, Privileged):
             pairs = enumerate(zip(batch.queries, batch.imagined.rollouts, strict=True))
             places = [place for place, (query, own) in pairs if own is not None and self._is_measured(query.key)]
             if places:
-                self._seen |= _replay(self._environments, batch, places, self._lpips)
+                oracle = self._oracle or WORLD_MODELS.make("oracle", space=batch.reviser.space)
+                self._seen |= _replay(self._environments, oracle, batch, places, self._lpips)
 
     def _is_measured(self, key: Key) -> bool:
         return bool(core.uniform(core.fold_key([key.seed, key.episode, key.decision, _MEASURE]), 1)[0] < self._share)
@@ -93,7 +96,11 @@ class _Truth:
 
 
 def _replay(
-    environments: LiveEnvironments, batch: ScoringBatch, places: Sequence[int], lpips: Lpips | None
+    environments: LiveEnvironments,
+    model: WorldModel,
+    batch: ScoringBatch,
+    places: Sequence[int],
+    lpips: Lpips | None,
 ) -> dict[Key, _Truth]:
     """Return the true rollouts and scores of each episode that has imagined rollouts."""
     imagined = [batch.imagined.rollouts[place] or () for place in places]
@@ -109,7 +116,7 @@ def _replay(
         _view_of(imagined[0][0], batch.reviser.frames.ends),
         Clock(),
     )
-    oracle = ModelImaginer(Attempted(WORLD_MODELS.make("oracle", space=batch.reviser.space), math.inf))
+    oracle = ModelImaginer(Attempted(model, math.inf))
     oracle.grant(environments)
     true = oracle.imagine(request)
     situations = [_copy_memory(batch.situations[place]) for place in places]

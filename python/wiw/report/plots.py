@@ -21,6 +21,7 @@ from matplotlib.ticker import MaxNLocator
 from wiw.analysis.blame import Blame
 from wiw.analysis.breakdowns import Breakdown
 from wiw.analysis.data_scaling import EQUAL_UPDATES, FEWER_SCENES, ONE_EPOCH, ScalingTable
+from wiw.analysis.errors import METRES, ErrorLine, ErrorTable
 from wiw.analysis.fidelity import ArmFidelity
 from wiw.analysis.intervals import wilson
 from wiw.analysis.marks import BLIND
@@ -233,6 +234,66 @@ def _find_range(found: ScalingTable, measure: str) -> tuple[float, float]:
     low, high = min(each.low for each in values), max(each.high for each in values)
     margin = 0.1 * (high - low) or 1.0
     return low - margin, high + margin
+
+
+ERROR_PANELS = (("looks", "flicker"), ("control",), ("content",))
+"""Families of errors that share axes."""
+
+
+def error_curves(tables: Sequence[ErrorTable]) -> Markup:
+    """Plot success and regret over the distance of frames from the true ones, a line for each kind of error."""
+    return _svg(_draw_errors(tables), "errors")
+
+
+def draw_errors(tables: Sequence[ErrorTable], form: str) -> bytes:
+    """Return the same picture on white, as "svg" or "png"."""
+    return _draw_on_white(_draw_errors(tables), form, "errors")
+
+
+def _draw_errors(tables: Sequence[ErrorTable]) -> Figure:
+    """Draw two rows of axes a task, success and regret, with a column for families and one for errors of place."""
+    figure = Figure(figsize=(3.4 * (len(ERROR_PANELS) + 1), 5.6 * len(tables)), layout="constrained")
+    grid = figure.subplots(2 * len(tables), len(ERROR_PANELS) + 1, squeeze=False, sharey="row")
+    for number, table in enumerate(tables):
+        for row, regret in ((2 * number, False), (2 * number + 1, True)):
+            for families, axes in zip((*ERROR_PANELS, ("control",)), grid[row], strict=True):
+                last = axes is grid[row][-1]
+                _style(axes)
+                _draw_error_kinds(axes, table, families, METRES if last else table.distance, regret)
+                if not regret:
+                    axes.set_title(f"{table.task}: {' and '.join(families)}", loc="left", fontsize=10, color=INK)
+                axes.set_xlabel("metres from the place" if last else table.distance, fontsize=9)
+            grid[row][0].set_ylabel("regret, less the oracle's" if regret else f"{table.label}, %", fontsize=9)
+    return figure
+
+
+def _draw_error_kinds(axes: Axes, table: ErrorTable, families: Sequence[str], measure: str, regret: bool) -> None:
+    lines = [line for line in table.lines if line.family in families and measure in line.measures]
+    ceiling = 0.0 if regret else table.references["oracle"].value
+    for kind, color in zip(dict.fromkeys(line.kind for line in lines), (*PALETTE, INK), strict=False):
+        own = [line for line in lines if line.kind == kind]
+        points = [(line.measures[measure].value, found) for line in own if (found := _find_error_point(line, regret))]
+        if not points:
+            continue
+        x, y = [0.0, *(at for at, _ in points)], [ceiling, *(found.value for _, found in points)]
+        axes.plot(x, y, color=color, lw=1.2, alpha=0.8)
+        bars = np.array([[found.value - found.low, found.high - found.value] for _, found in points]).T
+        axes.errorbar(
+            x[1:], y[1:], np.clip(bars, 0, None), fmt="o", color=color, ms=4, elinewidth=1, alpha=0.8, label=kind
+        )
+    axes.axhline(ceiling, color=ROLE_COLORS["oracle"], lw=1, ls=(0, (4, 3)))
+    axes.set_visible(bool(lines))
+    if not regret:
+        axes.axhline(table.references["none"].value, color=ROLE_COLORS["none"], lw=1, ls=":")
+        if lines:
+            axes.legend(frameon=False, labelcolor=INK, fontsize=8, ncols=2)
+
+
+def _find_error_point(line: ErrorLine, regret: bool) -> Any:
+    """Return the success of an arm, or its regret beyond the oracle's; None where it was not measured."""
+    if not regret:
+        return line.outcome
+    return None if line.regret is None else line.regret.estimate
 
 
 def blame_by_arm(found: Blame) -> Markup:

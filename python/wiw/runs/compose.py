@@ -25,6 +25,7 @@ from wiw.loop.rollout_cache import cache_rollouts
 from wiw.registry import WORLD_MODELS
 from wiw.types import PRIMITIVES, Episode, Key
 from wiw.world_models.base import WorldModel
+from wiw.world_models.oracle import Oracle
 
 
 @dataclass(frozen=True)
@@ -73,7 +74,9 @@ def compose(spec: AgentSpec, experiment: Experiment, limits: Limits, context: Ru
         reviser = TrueScores(reviser)
     if "proposals" in stages:
         policy = TruePlans(policy)
-    measured = [FidelityObserver(limits.lpips, limits.fidelity_share)] if limits.measures_fidelity else []
+    oracle = imaginer.model.unwrapped if imaginer is not None and imaginer.model is not None else None
+    truth = oracle if isinstance(oracle, Oracle) else None  # of the same size
+    measured = [FidelityObserver(limits.lpips, limits.fidelity_share, truth)] if limits.measures_fidelity else []
     observers = [*spec.observers, *measured]
     return Agent(policy, imaginer, reviser, config, observers=observers)
 

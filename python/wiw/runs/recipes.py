@@ -307,7 +307,7 @@ def find_control(model: Any) -> str:
 
 
 def _has_simulator(model: Any) -> bool:
-    """Return whether a world model, or one of that name, is handed the simulator; of the built-in ones the oracle is."""
+    """Return whether a world model, or one of that name, is handed the simulator; of the built-in ones oracle is."""
     found = WORLD_MODELS.find(model) if isinstance(model, str) else model
     return model == ERROR_MODEL or "simulator" in getattr(getattr(found, "accepts", None), "needs", ())
 

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from wiw._core import core
 from wiw.errors import ArgumentError
-from wiw.types import Conditioning, Control
+from wiw.types import GRIPPER_POSES, PRIMITIVES, Conditioning, Control
 from wiw.world_models.base import WorldModel
 
 Family = Literal["looks", "flicker", "control", "content"]
@@ -20,8 +20,8 @@ _PURPOSE = 0x6572726F
 """Keeps these draws apart from all others of a rollout."""
 
 
-class FutureError(ABC):
-    """An error of imagined futures, of a known dose; a dose of 0 changes nothing.
+class Degradation(ABC):
+    """An error of imagined futures, of a known dose. A dose of 0 changes nothing.
 
     All draws are by the seed of a rollout, and nested: what a dose does, a larger one does too.
 
@@ -77,6 +77,12 @@ class FutureError(ABC):
             seed: of the rollout.
         """
         return np.zeros((len(actions), 2))
+
+
+def per_space(primitives: tuple[float, ...], poses: tuple[float, ...] | None = None) -> Mapping[str, tuple[float, ...]]:
+    """Return doses by plan space: `poses` None means the same, and empty that the error makes no sense there."""
+    found = {PRIMITIVES: primitives, GRIPPER_POSES: primitives if poses is None else poses}
+    return {space: doses for space, doses in found.items() if doses}
 
 
 def make_generator(seed: int, *parts: int) -> np.random.Generator:

@@ -18,13 +18,13 @@ from numpy.typing import NDArray
 
 from wiw.datasets.questions.facts import STRUCTURE
 from wiw.errors import ArgumentError
-from wiw.experiments.errors.base import FutureError, make_generator
+from wiw.experiments.errors.base import Degradation, make_generator, per_space
 from wiw.experiments.errors.control import list_moves
 from wiw.experiments.errors.drawing import ComposedRenderer, DrawnBench, MovedRenderer
 from wiw.experiments.errors.forks import Walker, WorldFork
 from wiw.metrics import pose_error
 from wiw.tabletop.workbench import HIDDEN_DEPTH
-from wiw.types import GRIPPER_POSES, PRIMITIVES, Conditioning, Control
+from wiw.types import GRIPPER_POSES, Conditioning, Control
 from wiw.world_models.base import WorldModel
 
 BARRIERS = frozenset({"wall", "door", "door frame", "window"})
@@ -33,9 +33,6 @@ AROUND = 4.0
 """Metres from the agent within which things are invented."""
 TABLE_AREA = ((-0.1, 0.4), (-0.4, 0.4))
 """Metres in x and y between which things are invented on a table."""
-
-Offsets = dict[str, NDArray[np.float64]]
-"""Transforms [4, 4] in the world's frame, by a thing's name."""
 
 
 @dataclass(frozen=True)
@@ -51,7 +48,7 @@ class DrawnFork:
         return np.asarray(self.find_cameras(actions))
 
 
-class ContentError(FutureError):
+class ContentDegradation(Degradation):
     """An error of what is there."""
 
     family = "content"
@@ -80,13 +77,13 @@ class ContentError(FutureError):
         """Return a workbench that is drawn with the error, for plans of poses."""
 
 
-class Missing(ContentError):
+class Missing(ContentDegradation):
     """Things that are not there."""
 
     kind = "missing"
     about = "Leaves things out, each drawn for itself: furniture and small things, or what is on a table."
     unit = "share of the things"
-    doses = {PRIMITIVES: (0.25, 0.5, 1.0), GRIPPER_POSES: (0.25, 0.5, 1.0)}
+    doses = per_space((0.25, 0.5, 1.0))
     most = 1.0
 
     def draw_world(self, fork: WorldFork, seed: int) -> DrawnFork:
@@ -97,16 +94,18 @@ class Missing(ContentError):
         """Return a workbench without the things that are drawn to be missing."""
         names = list(bench.things)
         drawn = make_generator(seed).random(len(names)) < self.dose
-        return DrawnBench(bench, {name: shift(0, 0, -HIDDEN_DEPTH) for name, gone in zip(names, drawn) if gone})
+        return DrawnBench(
+            bench, {name: shift(0, 0, -HIDDEN_DEPTH) for name, gone in zip(names, drawn, strict=True) if gone}
+        )
 
 
-class Moved(ContentError):
+class Moved(ContentDegradation):
     """Things that are elsewhere."""
 
     kind = "moved"
     about = "Moves every thing horizontally, each in a direction of its own, through whatever is there."
     unit = "metres"
-    doses = {PRIMITIVES: (0.25, 0.5, 1.0), GRIPPER_POSES: (0.03, 0.1, 0.3)}
+    doses = per_space((0.25, 0.5, 1.0), (0.03, 0.1, 0.3))
 
     def draw_world(self, fork: WorldFork, seed: int) -> DrawnFork:
         """Return a fork whose things are drawn beside their places."""
@@ -126,13 +125,13 @@ class Moved(ContentError):
         )
 
 
-class Invented(ContentError):
+class Invented(ContentDegradation):
     """Things that do not exist."""
 
     kind = "invented"
     about = "Shows copies of things of the scene where there are none, on free floor within 4 m or on the table."
     unit = "copies per thing of the scene"
-    doses = {PRIMITIVES: (0.25, 0.5, 1.0), GRIPPER_POSES: (0.25, 0.5, 1.0)}
+    doses = per_space((0.25, 0.5, 1.0))
     most = 1.0
 
     def draw_world(self, fork: WorldFork, seed: int) -> DrawnFork:
@@ -154,12 +153,14 @@ class Invented(ContentError):
         places = generator.uniform(low, high, (len(names), 2))
         poses = bench.get_poses(names)
         offsets = {
-            name: shift(*(place - poses[name][:2, 3]), 0) for name, place, one in zip(names, places, drawn) if one
+            name: shift(*(place - poses[name][:2, 3]), 0)
+            for name, place, one in zip(names, places, drawn, strict=True)
+            if one
         }
         return DrawnBench(bench, offsets, copies=True)
 
 
-class OpenSpace(ContentError):
+class OpenSpace(ContentDegradation):
     """Hallucinated free space."""
 
     kind = "open"
@@ -168,7 +169,7 @@ class OpenSpace(ContentError):
         "drawn for each step."
     )
     unit = "share of the walls, doors and windows, and of the blocked steps"
-    doses = {PRIMITIVES: (0.25, 0.5, 1.0)}
+    doses = per_space((0.25, 0.5, 1.0), ())
     most = 1.0
 
     def draw_world(self, fork: WorldFork, seed: int) -> DrawnFork:
@@ -182,12 +183,10 @@ class OpenSpace(ContentError):
         raise ArgumentError("error 'open': a table has no walls; expected plans of primitives")
 
     def misplace(self, simulator: Any, actions: NDArray[Any], seed: int) -> NDArray[np.float64]:
-        """See `FutureError.misplace`."""
+        """See `Degradation.misplace`."""
         if not len(actions):
             return np.zeros((0, 2))
-        metres, angles = pose_error(
-            simulator.camera_poses_after(actions), self._find_cameras(simulator, actions, seed)
-        )
+        metres, angles = pose_error(simulator.camera_poses_after(actions), self._find_cameras(simulator, actions, seed))
         return np.stack([metres, np.degrees(angles)], axis=1)
 
     def _find_cameras(self, fork: WorldFork, actions: NDArray[np.int8], seed: int) -> NDArray[np.float64]:
@@ -244,6 +243,12 @@ def _choose(instances: Instances, generator: np.random.Generator, share: float) 
     """Return the instances that are drawn; those of a smaller share are among those of a larger one."""
     drawn = generator.random(len(instances.ids)) < share
     return Instances(instances.ids[drawn], instances.poses[drawn], instances.drop)
+
+
+def _choose_names(bench: Any, generator: np.random.Generator, share: float) -> list[str]:
+    """Return the things on a table that are drawn, likewise."""
+    drawn = generator.random(len(bench.things)) < share
+    return [name for name, one in zip(bench.things, drawn, strict=True) if one]
 
 
 def _hide(fork: WorldFork, instances: Instances) -> DrawnFork:

@@ -17,10 +17,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from wiw.action import FORWARD, TURN_LEFT, TURN_RIGHT, ActionSpace
-from wiw.experiments.errors.base import FutureError, make_generator
+from wiw.experiments.errors.base import Degradation, make_generator, per_space
 from wiw.experiments.errors.forks import Walker, WorldFork
 from wiw.metrics import pose_error
-from wiw.types import GRIPPER_POSES, PRIMITIVES, Conditioning, Control
+from wiw.types import GRIPPER_POSES, Conditioning, Control
 from wiw.world_models.base import WorldModel
 
 STRIDE, TURN = ActionSpace().forward_m, ActionSpace().turn_rad
@@ -31,7 +31,7 @@ Poses = NDArray[np.float64]
 """float64 [K + 1, 7]: poses of a gripper, the present one first."""
 
 
-class MotionError(FutureError):
+class MotionDegradation(Degradation):
     """An error of the motion that is imagined."""
 
     family = "control"
@@ -54,7 +54,7 @@ class MotionError(FutureError):
         return model.rollout(replace(observations, simulators=errant), controls, seeds)
 
     def misplace(self, simulator: Any, actions: NDArray[Any], seed: int) -> NDArray[np.float64]:
-        """See `FutureError.misplace`."""
+        """See `Degradation.misplace`."""
         if isinstance(simulator, WorldFork):
             metres, angles = pose_error(
                 simulator.camera_poses_after(actions), self.find_camera_poses(simulator, actions, seed)
@@ -88,7 +88,7 @@ class _ErrantFork:
     """Stands in for a fork of the simulator: another plan than the one asked for is executed."""
 
     fork: WorldFork
-    error: MotionError
+    error: MotionDegradation
     seed: int
 
     @property
@@ -105,13 +105,13 @@ def list_moves(actions: NDArray[np.int8]) -> Moves:
     return np.array([known.get(int(action), (0.0, 0.0, 0.0)) for action in actions]).reshape(-1, 3)
 
 
-class Scale(MotionError):
+class Scale(MotionDegradation):
     """Motion that leads too far."""
 
     kind = "scale"
     about = "Makes each stride and each turn longer, and each way of a gripper."
     unit = "share of the true length that is added"
-    doses = {PRIMITIVES: (0.5, 1.0, 2.0), GRIPPER_POSES: (0.25, 0.5, 1.0)}
+    doses = per_space((0.5, 1.0, 2.0), (0.25, 0.5, 1.0))
 
     def change_moves(self, moves: Moves, generator: np.random.Generator) -> Moves:
         """Return longer moves."""
@@ -124,13 +124,13 @@ class Scale(MotionError):
         return found
 
 
-class Direction(MotionError):
+class Direction(MotionDegradation):
     """Motion to one side."""
 
     kind = "direction"
     about = "Turns each stride to one side of its heading, and each way of a gripper about the vertical."
     unit = "degrees; to which side is drawn for each future"
-    doses = {PRIMITIVES: (30.0, 90.0, 180.0), GRIPPER_POSES: (10.0, 30.0, 90.0)}
+    doses = per_space((30.0, 90.0, 180.0), (10.0, 30.0, 90.0))
     most = 180.0
     draws_future = True
 
@@ -151,13 +151,13 @@ class Direction(MotionError):
         return found
 
 
-class Lag(MotionError):
+class Lag(MotionDegradation):
     """Frames that are behind the plan."""
 
     kind = "lag"
     about = "Shows after each action what followed an earlier one."
     unit = "actions"
-    doses = {PRIMITIVES: (1.0, 2.0, 4.0), GRIPPER_POSES: (1.0, 2.0, 3.0)}
+    doses = per_space((1.0, 2.0, 4.0), (1.0, 2.0, 3.0))
 
     def change_moves(self, moves: Moves, generator: np.random.Generator) -> Moves:
         """Return no move at first, then the plan's."""
@@ -172,13 +172,13 @@ class Lag(MotionError):
         return min(round(self.dose), len(plan))
 
 
-class Drift(MotionError):
+class Drift(MotionDegradation):
     """Motion that slips to one side, whatever the action."""
 
     kind = "drift"
     about = "Shifts the camera, or the gripper, sideways with every action."
     unit = "metres per action; the direction is drawn for each future"
-    doses = {PRIMITIVES: (0.05, 0.1, 0.2), GRIPPER_POSES: (0.02, 0.05, 0.1)}
+    doses = per_space((0.05, 0.1, 0.2), (0.02, 0.05, 0.1))
     draws_future = True
 
     def change_moves(self, moves: Moves, generator: np.random.Generator) -> Moves:
@@ -193,13 +193,13 @@ class Drift(MotionError):
         return found
 
 
-class Ignored(MotionError):
+class Ignored(MotionDegradation):
     """Actions without effect."""
 
     kind = "ignored"
     about = "Leaves out actions, each drawn for itself: nothing moves then."
     unit = "share of the actions"
-    doses = {PRIMITIVES: (0.25, 0.5, 1.0), GRIPPER_POSES: (0.25, 0.5, 1.0)}
+    doses = per_space((0.25, 0.5, 1.0))
     most = 1.0
     draws_future = True
 

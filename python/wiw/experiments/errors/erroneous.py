@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from wiw.envs.episode_state import count_leading_turns
 from wiw.envs.navigation import NavigationEnv
 from wiw.errors import ArgumentError
-from wiw.experiments.errors.base import FutureError
+from wiw.experiments.errors.base import Degradation
 from wiw.experiments.errors.forks import WorldFork
 from wiw.loop.imagination import Imagination, ImaginationWrapper, ModelInput, Request
 from wiw.loop.imagine import seed_of
@@ -27,7 +27,7 @@ from wiw.world_models.base import Accepts, WorldModel
 class ErroneousModel(ModelWrapper):
     """A world model whose rollouts have an error."""
 
-    def __init__(self, model: WorldModel, error: FutureError) -> None:
+    def __init__(self, model: WorldModel, error: Degradation) -> None:
         super().__init__(model)
         self.error = error
 
@@ -66,7 +66,7 @@ class Erroneous(ModelImaginer):
             the model's plans.
     """
 
-    def __init__(self, model: WorldModel, error: FutureError) -> None:
+    def __init__(self, model: WorldModel, error: Degradation) -> None:
         require_error(error, model.accepts.space, "simulator" in model.accepts.needs)
         super().__init__(ErroneousModel(model, error))
         self.error = error
@@ -96,7 +96,7 @@ class Erroneous(ModelImaginer):
 class MisplacedImagination(ImaginationWrapper):
     """Imagined futures that know how far from their places the frames were taken."""
 
-    def __init__(self, inner: Imagination, request: Request, error: FutureError) -> None:
+    def __init__(self, inner: Imagination, request: Request, error: Degradation) -> None:
         super().__init__(inner)
         self._request, self._error = request, error
 
@@ -126,7 +126,7 @@ class MisplacedImagination(ImaginationWrapper):
         return np.asarray(self._error.misplace(start, actions[turns:], seed).mean(axis=0))
 
 
-def require_error(error: FutureError, space: str, has_simulator: bool) -> None:
+def require_error(error: Degradation, space: str, has_simulator: bool) -> None:
     """Require that an error makes sense for plans of a space and a world model.
 
     Raises:

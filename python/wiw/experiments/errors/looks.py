@@ -10,8 +10,8 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from wiw.experiments.errors.base import FutureError, make_generator
-from wiw.types import GRIPPER_POSES, PRIMITIVES, Conditioning, Control
+from wiw.experiments.errors.base import Degradation, make_generator, per_space
+from wiw.types import Conditioning, Control
 from wiw.world_models.base import WorldModel
 
 WIDTH = 1024
@@ -24,7 +24,7 @@ PATCHES = 16
 Image = NDArray[np.uint8]
 
 
-class FrameError(FutureError):
+class FrameDegradation(Degradation):
     """An error of single frames."""
 
     needs_simulator = False
@@ -56,14 +56,14 @@ class FrameError(FutureError):
         """
 
 
-class Blur(FrameError):
+class Blur(FrameDegradation):
     """Frames out of focus."""
 
     kind = "blur"
     family = "looks"
     about = "Blurs each frame by a Gaussian."
     unit = "standard deviation in pixels of a frame 1024 wide"
-    doses = {PRIMITIVES: (4.0, 16.0, 64.0), GRIPPER_POSES: (4.0, 16.0, 64.0)}
+    doses = per_space((4.0, 16.0, 64.0))
 
     def degrade(self, frame: Image, seed: int, index: int, panorama: bool) -> Image:
         """Return the frame blurred; a panorama across its seam."""
@@ -76,14 +76,14 @@ class Blur(FrameError):
         return np.asarray(found[:, margin : margin + frame.shape[1]], np.uint8)
 
 
-class Resolution(FrameError):
+class Resolution(FrameDegradation):
     """Frames with fewer pixels."""
 
     kind = "resolution"
     family = "looks"
     about = "Shrinks each frame and enlarges it again, by areas and by linear interpolation."
     unit = "side of a pixel in pixels of a frame 1024 wide, less one"
-    doses = {PRIMITIVES: (7.0, 31.0, 127.0), GRIPPER_POSES: (7.0, 31.0, 127.0)}
+    doses = per_space((7.0, 31.0, 127.0))
 
     def degrade(self, frame: Image, seed: int, index: int, panorama: bool) -> Image:
         """Return the frame at its own size, with the details of fewer pixels."""
@@ -93,29 +93,29 @@ class Resolution(FrameError):
         return np.asarray(cv2.resize(shrunk, (width, height), interpolation=cv2.INTER_LINEAR), np.uint8)
 
 
-class Noise(FrameError):
+class Noise(FrameDegradation):
     """Grainy frames."""
 
     kind = "noise"
     family = "looks"
-    about = "Adds Gaussian noise to each channel of each pixel, drawn anew for each frame."
+    about = "Adds Gaussian noise to each channel of each pixel of a frame 1024 wide, drawn anew for each frame."
     unit = "standard deviation in grey levels of 255"
-    doses = {PRIMITIVES: (10.0, 40.0, 120.0), GRIPPER_POSES: (10.0, 40.0, 120.0)}
+    doses = per_space((10.0, 40.0, 120.0))
 
     def degrade(self, frame: Image, seed: int, index: int, panorama: bool) -> Image:
-        """Return the frame with noise."""
+        """Return the frame with noise; in a smaller one as much as is left of it once a large one is shrunk."""
         drawn = make_generator(seed, index).standard_normal(frame.shape, np.float32)
-        return _add(frame, self.dose * drawn)
+        return _add(frame, self.dose * min(1.0, frame.shape[1] / WIDTH) * drawn)
 
 
-class Tint(FrameError):
+class Tint(FrameDegradation):
     """A colour cast."""
 
     kind = "tint"
     family = "looks"
     about = "Adds one colour to all pixels of a future, drawn from all directions in RGB."
     unit = "length of the colour in grey levels of 255"
-    doses = {PRIMITIVES: (15.0, 40.0, 100.0), GRIPPER_POSES: (15.0, 40.0, 100.0)}
+    doses = per_space((15.0, 40.0, 100.0))
     draws_future = True
 
     def degrade(self, frame: Image, seed: int, index: int, panorama: bool) -> Image:
@@ -124,14 +124,14 @@ class Tint(FrameError):
         return _add(frame, self.dose * color / np.linalg.norm(color))
 
 
-class Flicker(FrameError):
+class Flicker(FrameDegradation):
     """Frames that do not go together, as if each were generated with a seed of its own."""
 
     kind = "flicker"
     family = "flicker"
     about = "Adds soft patches of colour, 16 across, to each frame, drawn anew for each."
     unit = "standard deviation in grey levels of 255"
-    doses = {PRIMITIVES: (8.0, 20.0, 60.0), GRIPPER_POSES: (8.0, 20.0, 60.0)}
+    doses = per_space((8.0, 20.0, 60.0))
 
     def degrade(self, frame: Image, seed: int, index: int, panorama: bool) -> Image:
         """Return the frame with patches of its own."""
