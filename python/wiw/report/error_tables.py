@@ -162,7 +162,7 @@ def _tell_cost(found: Cost, label: str) -> str:
     sure = "" if found.loss.excludes_zero else ", which may be chance"
     return (
         f"Errors of {found.family} cost {show_estimate(found.loss)} points of {label} per {_name_step(found.measure)} "
-        f"({found.arms} arms){sure}."
+        f"({found.arms} {'arm' if found.arms == 1 else 'arms'}){sure}."
     )
 
 

@@ -21,7 +21,7 @@ from matplotlib.ticker import MaxNLocator
 from wiw.analysis.blame import Blame
 from wiw.analysis.breakdowns import Breakdown
 from wiw.analysis.data_scaling import EQUAL_UPDATES, FEWER_SCENES, ONE_EPOCH, ScalingTable
-from wiw.analysis.errors import METRES, ErrorLine, ErrorTable
+from wiw.analysis.errors import METRES, PSNR, ErrorLine, ErrorTable
 from wiw.analysis.fidelity import ArmFidelity
 from wiw.analysis.intervals import wilson
 from wiw.analysis.marks import BLIND
@@ -236,6 +236,7 @@ def _find_range(found: ScalingTable, measure: str) -> tuple[float, float]:
     return low - margin, high + margin
 
 
+FAMILY_COLORS = {"looks": "#4c78a8", "flicker": "#8e6bbf", "control": "#d1495b", "content": "#b5651d"}
 ERROR_PANELS = (("looks", "flicker"), ("control",), ("content",))
 """Families of errors that share axes."""
 
@@ -251,25 +252,29 @@ def draw_errors(tables: Sequence[ErrorTable], form: str) -> bytes:
 
 
 def _draw_errors(tables: Sequence[ErrorTable]) -> Figure:
-    """Draw two rows of axes a task, success and regret, with a column for families and one for errors of place."""
-    figure = Figure(figsize=(3.4 * (len(ERROR_PANELS) + 1), 5.6 * len(tables)), layout="constrained")
-    grid = figure.subplots(2 * len(tables), len(ERROR_PANELS) + 1, squeeze=False, sharey="row")
+    """Draw two rows of axes a task, success and regret: a column for each panel, then by PSNR and by place."""
+    columns = len(ERROR_PANELS) + 2
+    figure = Figure(figsize=(3.2 * columns, 5.6 * len(tables)), layout="constrained")
+    grid = figure.subplots(2 * len(tables), columns, squeeze=False, sharey="row")
     for number, table in enumerate(tables):
-        for row, regret in ((2 * number, False), (2 * number + 1, True)):
-            for families, axes in zip((*ERROR_PANELS, ("control",)), grid[row], strict=True):
-                last = axes is grid[row][-1]
-                _style(axes)
-                _draw_error_kinds(axes, table, families, METRES if last else table.distance, regret)
-                if not regret:
-                    axes.set_title(f"{table.task}: {' and '.join(families)}", loc="left", fontsize=10, color=INK)
-                axes.set_xlabel("metres from the place" if last else table.distance, fontsize=9)
-            grid[row][0].set_ylabel("regret, less the oracle's" if regret else f"{table.label}, %", fontsize=9)
+        for row, regret in zip(grid[2 * number : 2 * number + 2], (False, True), strict=True):
+            for families, axes in zip(ERROR_PANELS, row[:-2], strict=True):
+                _draw_error_kinds(axes, table, families, table.distance, regret)
+                axes.set_title("" if regret else f"{table.task}: {' and '.join(families)}", loc="left", fontsize=10)
+            _draw_error_families(row[-2], table, PSNR, regret)
+            _draw_error_kinds(row[-1], table, ("control",), METRES, regret)
+            for axes, label in zip(row[-2:], ("PSNR, dB", "metres from the place"), strict=True):
+                axes.set_xlabel(label, fontsize=9)
+            row[0].set_ylabel("regret, less the oracle's" if regret else f"{table.label}, %", fontsize=9)
     return figure
 
 
 def _draw_error_kinds(axes: Axes, table: ErrorTable, families: Sequence[str], measure: str, regret: bool) -> None:
+    """Draw a line for each kind of error in some families, from the oracle to its largest dose."""
     lines = [line for line in table.lines if line.family in families and measure in line.measures]
-    ceiling = 0.0 if regret else table.references["oracle"].value
+    ceiling = _prepare_error_axes(axes, table, regret)
+    axes.set_visible(bool(lines))
+    axes.set_xlabel(measure, fontsize=9)
     for kind, color in zip(dict.fromkeys(line.kind for line in lines), (*PALETTE, INK), strict=False):
         own = [line for line in lines if line.kind == kind]
         points = [(line.measures[measure].value, found) for line in own if (found := _find_error_point(line, regret))]
@@ -281,12 +286,30 @@ def _draw_error_kinds(axes: Axes, table: ErrorTable, families: Sequence[str], me
         axes.errorbar(
             x[1:], y[1:], np.clip(bars, 0, None), fmt="o", color=color, ms=4, elinewidth=1, alpha=0.8, label=kind
         )
+    if lines and not regret:
+        axes.legend(frameon=False, labelcolor=INK, fontsize=8, ncols=2)
+
+
+def _draw_error_families(axes: Axes, table: ErrorTable, measure: str, regret: bool) -> None:
+    """Draw a dot for each arm, in the colour of its family."""
+    _prepare_error_axes(axes, table, regret)
+    for family in dict.fromkeys(line.family for line in table.lines):
+        own = [line for line in table.lines if line.family == family and measure in line.measures]
+        points = [(line.measures[measure].value, found) for line in own if (found := _find_error_point(line, regret))]
+        x, y = [at for at, _ in points], [found.value for _, found in points]
+        axes.plot(x, y, "o", color=FAMILY_COLORS[family], ms=5, alpha=0.8, label=family)
+    if table.lines and not regret:
+        axes.legend(frameon=False, labelcolor=INK, fontsize=8, ncols=2)
+
+
+def _prepare_error_axes(axes: Axes, table: ErrorTable, regret: bool) -> float:
+    """Draw the levels of the references; return that of the oracle."""
+    _style(axes)
+    ceiling = 0.0 if regret else table.references["oracle"].value
     axes.axhline(ceiling, color=ROLE_COLORS["oracle"], lw=1, ls=(0, (4, 3)))
-    axes.set_visible(bool(lines))
     if not regret:
         axes.axhline(table.references["none"].value, color=ROLE_COLORS["none"], lw=1, ls=":")
-        if lines:
-            axes.legend(frameon=False, labelcolor=INK, fontsize=8, ncols=2)
+    return ceiling
 
 
 def _find_error_point(line: ErrorLine, regret: bool) -> Any:

@@ -9,7 +9,7 @@ success is due to the error and nothing else (`wiw.experiments.errors`).
 from __future__ import annotations
 
 import json
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from contextlib import ExitStack
 from dataclasses import asdict, dataclass
 from pathlib import Path
@@ -179,7 +179,7 @@ def _run_task(
 ) -> list[Path]:
     """Run all arms of a task, part by part; return the folders of the runs."""
     recipe, agent = _make_recipes(task, settings)
-    arms = [FLOOR, CEILING, *settings.list_arms(task)]
+    arms = [FLOOR, CEILING, *_order_arms(settings.list_arms(task))]
     count = -(-settings.episodes // BLOCK)
     done = []
     for number in range(1, count + 1):
@@ -204,6 +204,14 @@ def _run_task(
         done.append(folder / shard.folder)
         watch(task, number, count, f"{shard.select(settings.episodes).stop}/{settings.episodes} episodes")
     return done
+
+
+def _order_arms(arms: Mapping[str, tuple[str, float]]) -> list[str]:
+    """Return the arms with the largest dose of each kind first, so that a study that is cut off has all kinds."""
+    doses: dict[str, list[float]] = {}
+    for kind, dose in arms.values():
+        doses.setdefault(kind, []).append(dose)
+    return sorted(arms, key=lambda arm: -doses[arms[arm][0]].index(arms[arm][1]))
 
 
 def _make_recipes(task: str, settings: ErrorSettings) -> tuple[TaskRecipe, AgentRecipe]:
