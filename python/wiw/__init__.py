@@ -58,6 +58,7 @@ __all__ = [
     "scenes",
     "show",
     "status",
+    "study_errors",
     "types",
     "verify",
     "world_model",
@@ -91,6 +92,7 @@ _HOME = {
     "scale": "wiw.studies.scale",
     "show": "wiw.viz.show",
     "status": "wiw.runs.status",
+    "study_errors": "wiw.studies.errors",
     "verify": "wiw.runs.verify",
     "world_model": "wiw.registry",
 }
@@ -150,6 +152,7 @@ if TYPE_CHECKING:
     from wiw.studies.blame import blame
     from wiw.studies.compare import compare
     from wiw.studies.data_scaling import data_scaling
+    from wiw.studies.errors import study_errors
     from wiw.studies.evaluate import evaluate
     from wiw.studies.judge import judge
     from wiw.studies.model_check import check_model

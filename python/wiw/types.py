@@ -359,6 +359,8 @@ class Fidelity:
     ssim: NDArray[np.float64]
     lpips: NDArray[np.float64] | None = None
     """float64 [M]: the same of perspective views, lower is truer; None where it is not measured."""
+    pose_errors: NDArray[np.float64] | None = None
+    """float64 [M, 2], metres and degrees: how far from their places the frames were taken; None where nobody knows."""
 
     def regret(self, chosen: int | None) -> float:
         """Return how much less than the best the chosen plan scores in truth; NaN for a plan made anew."""

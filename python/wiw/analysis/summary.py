@@ -47,6 +47,9 @@ PLACEBOS = {
 """Arms with the compute of a world model and uninformative imagination; ":" and a model's name may follow."""
 REPEATS = {RESEEDED: "noise floor: the same with other random numbers"}
 """Arms that repeat another one of the run; ":" and a model's name follow."""
+ERROR = "error-"
+"""What the names of arms begin with whose futures have an error of a known dose."""
+ERRONEOUS = "control: futures with an error of a known dose"
 GAINS = {
     "none": "Gain over the policy without a world model",
     "copy": "Gain over the floor, which predicts that nothing changes",
@@ -390,6 +393,8 @@ def role_of(arm: str, policies: Collection[str] = ()) -> str:
     if arm in ROLES:
         return ROLES[arm]
     kind = arm.rpartition("+")[2].partition(":")[0]
+    if kind.startswith(ERROR):
+        return ERRONEOUS
     special = {**PLACEBOS, **REPEATS}.get(RESEEDED if kind.startswith(f"{RESEEDED}-") else kind)
     return special or (ANOTHER_POLICY if arm in policies else WORLD_MODEL)
 

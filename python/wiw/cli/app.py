@@ -37,7 +37,7 @@ from wiw.cli.serve import serve
 from wiw.cli.serve_vlm import serve_vlm
 from wiw.cli.status import status
 from wiw.cli.stop import EXIT_RESUME, Terminated, end_process, raise_on_stop_signals
-from wiw.cli.study import study_data_scaling
+from wiw.cli.study import study_data_scaling, study_errors
 from wiw.cli.submit import cancel, submit
 from wiw.cli.terminal import printable
 from wiw.cli.train import train
@@ -162,14 +162,18 @@ GROUPS: Mapping[str, Group] = {
         ((import_prompts, "import", "Write a folder of prompts from LaTeX source or published code."),),
     ),
     "study": Group(
-        "Train and measure many small world models to answer a question.",
-        """Train and measure many small world models to answer a question. Repeat an interrupted command to resume it.
+        "Answer a question by many small trainings, or by many runs.",
+        """Answer a question by many small trainings, or by many runs. Repeat an interrupted command to resume it.
 
+  $ wiw study errors --small --workers 2
   $ wiw study data-scaling --small --workers 2
   $ wiw study data-scaling --data data --workers 4
 
 `wiw study WHAT --help` explains each with examples.""",
-        ((study_data_scaling, "data-scaling", "Does a world model get better with data, or with updates?"),),
+        (
+            (study_data_scaling, "data-scaling", "Does a world model get better with data, or with updates?"),
+            (study_errors, "errors", "What kind of error of imagined futures costs success?"),
+        ),
     ),
 }
 

@@ -10,11 +10,13 @@ from typing import Any, Literal
 from rich.markup import escape
 from tyro.conf import Positional
 
-What = Literal["all", "world-models", "policies", "trackers", "tasks", "presets", "metrics", "vlm-models", "prompts"]
+What = Literal[
+    "all", "world-models", "policies", "trackers", "tasks", "presets", "metrics", "errors", "vlm-models", "prompts"
+]
 
 
 def list_names(what: Positional[What] = "all", /) -> int:
-    """List everything with a name: world models, policies, trackers, tasks, presets, metrics, VLMs and prompts.
+    """List everything with a name: world models, policies, trackers, tasks, presets, metrics, errors, VLMs and prompts.
 
     $ wiw list
     $ wiw list world-models
@@ -55,7 +57,7 @@ def _make_table(what: str) -> Any:
         name: lambda table, name=name, registry=registry: _add_registry(table, name, registry)  # type: ignore[misc]
         for name, registry in registries.items()
     }
-    sections |= {"presets": _add_presets, "vlm-models": _add_vlm_models, "prompts": _add_prompts}
+    sections |= {"errors": _add_errors, "presets": _add_presets, "vlm-models": _add_vlm_models, "prompts": _add_prompts}
     if what == "presets":
         _add_presets(table, detailed=True)
         return table
@@ -90,6 +92,15 @@ def _add_presets(table: Any, detailed: bool = False) -> None:
             table.add_row(f"  {name}", escape(presets.describe_preset(task, name)))
             if detailed:
                 _add_settings(table, task, name)
+    table.add_row()
+
+
+def _add_errors(table: Any) -> None:
+    from wiw.experiments.errors import ERRORS
+
+    table.add_row("[bold]Errors of futures[/]", "[dim]--arms error-KIND@DOSE[:MODEL]; of the oracle without MODEL[/]")
+    for name, kind in ERRORS.items():
+        table.add_row(f"  {name}", f"{escape(kind.about)} [dim]Dose: {escape(kind.unit)}.[/]")
     table.add_row()
 
 

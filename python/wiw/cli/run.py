@@ -63,8 +63,9 @@ def run(
         arms: World models to run on the same episodes, or POLICY+MODEL for one with another policy; --world-model joins
             them if it is not among them. placebo-shuffled and placebo-swapped let it (or warp) imagine as much, but
             other plans, or from elsewhere; placebo-blind asks a text model with an empty prompt; placebo-shuffled:MODEL
-            names another. NAME=MODEL?KEY=VALUE names an arm and gives its model options, several with & between them
-            (in quotes), besides those of --world-model-option.
+            names another. error-KIND@DOSE lets the futures of the oracle have an error, as error-blur@16 (`wiw list
+            errors`), error-blur@16:MODEL those of another model. NAME=MODEL?KEY=VALUE names an arm and gives its model
+            options, several with & between them (in quotes), besides those of --world-model-option.
         noise_floor: Also run the arm of --world-model, or the last of --arms, once more with other random numbers
             (reseeded:MODEL, which --arms takes too): the report says how much it differs from itself.
         rules: What it is run on.

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""`wiw study data-scaling`."""
+"""`wiw study data-scaling` and `wiw study errors`."""
 
 from __future__ import annotations
 
@@ -83,6 +83,93 @@ def study_data_scaling(
     settings = replace(SMALL if small else FULL, **changes | lists)
     with announce_resume(), Bars() as bars:
         found = data_scaling(data, out, settings, workers=workers, episodes=imagenav, watch=bars.show)
+    found.summary()
+    for path in found.save():
+        print(path)
+    return 0
+
+
+def study_errors(
+    *,
+    out: Annotated[Path, arg(metavar="DIR")] = Path("runs/errors"),
+    small: bool = False,
+    tasks: Annotated[str | None, arg(metavar="A,B,...")] = None,
+    kinds: Annotated[str | None, arg(metavar="A,B,...")] = None,
+    doses: Annotated[int | None, arg(metavar="1|2|3")] = None,
+    episodes: Annotated[int | None, arg(metavar="N")] = None,
+    seed: Annotated[int | None, arg(metavar="N")] = None,
+    scenes: Annotated[str | None, arg(metavar="SPEC")] = None,
+    per_scene: Annotated[int | None, arg(metavar="N")] = None,
+    policy: Annotated[str | None, arg(metavar="NAME")] = None,
+    size: Annotated[tuple[int, int] | None, arg(metavar="H W")] = None,
+    fidelity_share: Annotated[float | None, arg(metavar="SHARE")] = None,
+    lpips: Annotated[str | None, arg(metavar="auto|DIR")] = None,
+    read_only: bool = False,
+    workers: Annotated[int, arg(metavar="N")] = 1,
+) -> int:
+    """What kind of error costs success? The oracle's true futures, made worse by known doses, one error at a time.
+
+    $ wiw study errors --small --workers 2                     # imagenav, four errors; about three minutes on two cores
+    $ wiw study errors --tasks imagenav --size 144 256 --workers 4
+    $ wiw study errors --workers 16 --lpips auto               # all tasks, errors and doses: hours
+    $ wiw study errors --tasks ar --read-only                  # tables and page of what has been run so far
+
+    Looks (blur, noise, tint, resolution), flicker, control (scale, direction, lag, drift, ignored) and content
+    (missing, moved, invented, open); `wiw list errors` says what each does and the unit of its doses. All arms, none
+    and oracle among them, run on the same episodes, and every number is paired with the oracle: success, regret of the
+    choices, and how far frames and cameras were from the true ones. An error that makes no sense in a task is left out
+    and named.
+
+    Writes errors.html, .svg, .png and .json into the folder, beside ordinary runs that hold a few episodes each, of all
+    arms. After Ctrl-C the same command goes on. Any run takes single errors as arms: `wiw run imagenav --arms
+    none,error-blur@16,oracle`. docs/errors.md has what came out here.
+
+    Args:
+        out: New folder, or one that the same command began.
+        small: Whether to take the numbers of the small version where no others are given.
+        tasks: Of imagenav, ar, aeqa and manipulation; all if not given.
+        kinds: Of the errors; all if not given.
+        doses: How many doses of each, the largest ones; 3 if not given.
+        episodes: Of each task; 100 if not given.
+        seed: Of all randomness; 0 if not given.
+        scenes: As in `wiw run`, of tasks in which an agent walks.
+        per_scene: Episodes in a scene; 2 if not given, as intervals are over scenes.
+        policy: The task's own if not given.
+        size: Height and width of the oracle's frames; 576 1024, or 480 480 before a table, if not given. The policy
+            matcher looks at 64x128, so that less is enough and several times faster.
+        fidelity_share: Share of the decisions at which regret and distances are measured; 0.25 if not given.
+        lpips: Weights of LPIPS (see `wiw run --lpips`); 1 - SSIM takes its place if not given.
+        read_only: Whether to run nothing, and show what is there.
+        workers: Processes; results do not depend on it.
+    """
+    from dataclasses import replace
+
+    from wiw.cli.bars import Bars
+    from wiw.cli.stop import announce_resume
+    from wiw.studies.errors import FULL, SMALL, read_errors
+    from wiw.studies.errors import study_errors as study
+
+    texts = {"tasks": tasks, "kinds": kinds}
+    given: dict[str, Any] = {
+        name: tuple(part.strip() for part in text.split(",")) for name, text in texts.items() if text is not None
+    }
+    given |= {
+        "doses": doses,
+        "episodes": episodes,
+        "seed": seed,
+        "scenes": scenes,
+        "per_scene": per_scene,
+        "policy": policy,
+        "size": size,
+        "fidelity_share": fidelity_share,
+    }
+    changes = {name: value for name, value in given.items() if value is not None}
+    settings = replace(SMALL if small else FULL, **changes)
+    if read_only:
+        found = read_errors(out, settings)
+    else:
+        with announce_resume(), Bars() as bars:
+            found = study(out, settings, workers=workers, lpips=lpips, watch=bars.show)
     found.summary()
     for path in found.save():
         print(path)

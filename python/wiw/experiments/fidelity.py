@@ -21,6 +21,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from wiw._core import core
+from wiw.errors import ArgumentError
 from wiw.loop.attempts import Attempted
 from wiw.loop.clock import Clock
 from wiw.loop.contract import check_scores
@@ -32,9 +34,12 @@ from wiw.metrics import Lpips, psnr, rank_agreement, ssim
 from wiw.policies.base import FrameSpec, Situation
 from wiw.registry import WORLD_MODELS
 from wiw.types import Decision, Fidelity, Key, Rollout
+from wiw.world_models.base import WorldModel
 
 PERSPECTIVE = (256, 256)
 """Size of the views that LPIPS is taken of."""
+_MEASURE = 0x66696465
+"""Keeps the draw whether to measure apart from all others of the decision."""
 
 
 class FidelityObserver(Observer, Privileged):
@@ -42,13 +47,19 @@ class FidelityObserver(Observer, Privileged):
 
     Args:
         lpips: folder of the weights of LPIPS ("auto": `~/.cache/wiw/weights`), to measure fidelity by it as well.
+        share: of the decisions that are measured, above 0 to 1, drawn by their keys: what a smaller share measures, a
+            larger one does too.
+        oracle: which the plans are replayed in; one of the usual size where None.
 
     Raises:
         WeightsError: those of LPIPS are not there.
+        ArgumentError: a share out of range.
     """
 
-    def __init__(self, lpips: str | Path | None = None) -> None:
-        self._lpips = None if lpips is None else Lpips(lpips)
+    def __init__(self, lpips: str | Path | None = None, share: float = 1.0, oracle: WorldModel | None = None) -> None:
+        if not 0 < share <= 1:
+            raise ArgumentError(f"fidelity: expected a share above 0 and up to 1, got {share}")
+        self._lpips, self._share, self._oracle = None if lpips is None else Lpips(lpips), share, oracle
         self._environments = LiveEnvironments()
         self._seen: dict[Key, _Truth] = {}
 
@@ -59,9 +70,14 @@ class FidelityObserver(Observer, Privileged):
     def watch(self, batch: ScoringBatch) -> None:
         """Replay the plans in the simulator, and score the true rollouts with copies of the reviser's memories."""
         with batch.clock("replay"):
-            places = [place for place, own in enumerate(batch.imagined.rollouts) if own is not None]
+            pairs = enumerate(zip(batch.queries, batch.imagined.rollouts, strict=True))
+            places = [place for place, (query, own) in pairs if own is not None and self._is_measured(query.key)]
             if places:
-                self._seen |= _replay(self._environments, batch, places, self._lpips)
+                oracle = self._oracle or WORLD_MODELS.make("oracle", space=batch.reviser.space)
+                self._seen |= _replay(self._environments, oracle, batch, places, self._lpips)
+
+    def _is_measured(self, key: Key) -> bool:
+        return bool(core.uniform(core.fold_key([key.seed, key.episode, key.decision, _MEASURE]), 1)[0] < self._share)
 
     def annotate(self, decision: Decision) -> Decision:
         """Add the fidelity of a decision's imagination."""
@@ -76,10 +92,15 @@ class _Truth:
     rollouts: Sequence[Rollout]
     scores: NDArray[np.float64]
     distances: NDArray[np.float64] | None
+    pose_errors: NDArray[np.float64] | None
 
 
 def _replay(
-    environments: LiveEnvironments, batch: ScoringBatch, places: Sequence[int], lpips: Lpips | None
+    environments: LiveEnvironments,
+    model: WorldModel,
+    batch: ScoringBatch,
+    places: Sequence[int],
+    lpips: Lpips | None,
 ) -> dict[Key, _Truth]:
     """Return the true rollouts and scores of each episode that has imagined rollouts."""
     imagined = [batch.imagined.rollouts[place] or () for place in places]
@@ -95,7 +116,7 @@ def _replay(
         _view_of(imagined[0][0], batch.reviser.frames.ends),
         Clock(),
     )
-    oracle = ModelImaginer(Attempted(WORLD_MODELS.make("oracle", space=batch.reviser.space), math.inf))
+    oracle = ModelImaginer(Attempted(model, math.inf))
     oracle.grant(environments)
     true = oracle.imagine(request)
     situations = [_copy_memory(batch.situations[place]) for place in places]
@@ -106,8 +127,10 @@ def _replay(
         view = FrameSpec("front" if batch.imagined.view == "perspective" else "surround", PERSPECTIVE)
         shown, truths = batch.imagined.show(view), true.show(view)
         distances = _distances(lpips, [shown[place] for place in places], truths)
-    found = zip(queries, rollouts, scores, distances, strict=True)
-    return {query.key: _Truth(own, score, distance) for query, own, score, distance in found}
+    known = batch.imagined.pose_errors
+    misplaced = [None if known is None else known[place] for place in places]
+    found = zip(queries, rollouts, scores, distances, misplaced, strict=True)
+    return {query.key: _Truth(*measured) for query, *measured in found}
 
 
 def _copy_memory(situation: Situation) -> Situation:
@@ -122,7 +145,13 @@ def _compare(imagined: Sequence[Rollout], scores: NDArray[np.float64], truth: _T
     errors = np.array([_errors(one, other) for one, other in zip(imagined, truth.rollouts, strict=True)])
     agreement = rank_agreement(scores, truth.scores)
     return Fidelity(
-        tuple(truth.rollouts), truth.scores, agreement, psnr=errors[:, 0], ssim=errors[:, 1], lpips=truth.distances
+        tuple(truth.rollouts),
+        truth.scores,
+        agreement,
+        psnr=errors[:, 0],
+        ssim=errors[:, 1],
+        lpips=truth.distances,
+        pose_errors=truth.pose_errors,
     )
 
 

@@ -65,6 +65,9 @@ class PartialImagination(Imagination):
         self.costs: list[Mapping[str, int]] = [{}] * episodes
         for place, own, cost in zip(places, inner.rollouts, inner.costs, strict=True):
             self.rollouts[place], self.costs[place] = own, cost
+        if inner.pose_errors is not None:
+            known = dict(zip(places, inner.pose_errors, strict=True))
+            self.pose_errors = [known.get(place) for place in range(episodes)]
 
     def show(self, frames: FrameSpec) -> list[list[Rollout]]:
         """Return the rollouts in other views, none for an episode of which nothing was imagined."""

@@ -67,6 +67,9 @@ class Imagination(ABC):
     """What each episode asked for: consultations, rows and frames."""
     view: View = "perspective"
     """That the model imagines."""
+    pose_errors: Sequence[NDArray[np.float64] | None] | None = None
+    """float64 [M, 2] by episode, metres and degrees: how far from their places each plan's frames were taken, in the
+    mean; NaN for a plan without imagined frames. None where nobody knows, as for most models."""
 
     @abstractmethod
     def show(self, frames: FrameSpec) -> list[list[Rollout]]:
@@ -79,6 +82,21 @@ class Imagination(ABC):
             NotImplementedError: plans of this space end in no place from which more could be proposed.
         """
         raise NotImplementedError(f"{type(self).__name__} has no places at the ends of plans")
+
+
+class ImaginationWrapper(Imagination):
+    """Base of imaginations that add something to another one."""
+
+    def __init__(self, inner: Imagination) -> None:
+        self.inner, self.rollouts, self.costs, self.view = inner, inner.rollouts, inner.costs, inner.view
+
+    def show(self, frames: FrameSpec) -> list[list[Rollout]]:
+        """Return what the wrapped imagination shows."""
+        return self.inner.show(frames)
+
+    def ends(self, chosen: Sequence[tuple[int, int]]) -> tuple[NDArray[np.uint8], NDArray[np.uint8]]:
+        """Return the ends of the wrapped imagination."""
+        return self.inner.ends(chosen)
 
 
 class NoImagination(Imagination):

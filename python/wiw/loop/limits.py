@@ -38,6 +38,8 @@ class Limits:
     fidelity: bool = False
     """Whether every imagined plan is also replayed in the simulator, to measure how true imagination was. Changes no
     decision, but takes about as long as the oracle."""
+    fidelity_share: Annotated[float, arg(metavar="SHARE")] = 1.0
+    """Share of the decisions that fidelity is measured at, drawn by their keys."""
     lpips: Annotated[str | Path | None, arg(metavar="auto|DIR")] = None
     """Folder with the weights of LPIPS, to measure fidelity by it as well (auto: ~/.cache/wiw/weights). Where they are
     not there, it says which files are needed."""
@@ -46,6 +48,8 @@ class Limits:
         for name in ("deadline", "cache_gb"):
             if not getattr(self, name) > 0:
                 raise ArgumentError(f"expected a {name} above 0, got {getattr(self, name)}")
+        if not 0 < self.fidelity_share <= 1:
+            raise ArgumentError(f"expected a fidelity_share above 0 and up to 1, got {self.fidelity_share}")
 
     @property
     def measures_fidelity(self) -> bool:

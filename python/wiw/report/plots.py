@@ -21,6 +21,7 @@ from matplotlib.ticker import MaxNLocator
 from wiw.analysis.blame import Blame
 from wiw.analysis.breakdowns import Breakdown
 from wiw.analysis.data_scaling import EQUAL_UPDATES, FEWER_SCENES, ONE_EPOCH, ScalingTable
+from wiw.analysis.errors import METRES, PSNR, ErrorLine, ErrorTable
 from wiw.analysis.fidelity import ArmFidelity
 from wiw.analysis.intervals import wilson
 from wiw.analysis.marks import BLIND
@@ -233,6 +234,89 @@ def _find_range(found: ScalingTable, measure: str) -> tuple[float, float]:
     low, high = min(each.low for each in values), max(each.high for each in values)
     margin = 0.1 * (high - low) or 1.0
     return low - margin, high + margin
+
+
+FAMILY_COLORS = {"looks": "#4c78a8", "flicker": "#8e6bbf", "control": "#d1495b", "content": "#b5651d"}
+ERROR_PANELS = (("looks", "flicker"), ("control",), ("content",))
+"""Families of errors that share axes."""
+
+
+def error_curves(tables: Sequence[ErrorTable]) -> Markup:
+    """Plot success and regret over the distance of frames from the true ones, a line for each kind of error."""
+    return _svg(_draw_errors(tables), "errors")
+
+
+def draw_errors(tables: Sequence[ErrorTable], form: str) -> bytes:
+    """Return the same picture on white, as "svg" or "png"."""
+    return _draw_on_white(_draw_errors(tables), form, "errors")
+
+
+def _draw_errors(tables: Sequence[ErrorTable]) -> Figure:
+    """Draw two rows of axes a task, success and regret: a column for each panel, then by PSNR and by place."""
+    columns = len(ERROR_PANELS) + 2
+    figure = Figure(figsize=(3.2 * columns, 5.6 * len(tables)), layout="constrained")
+    grid = figure.subplots(2 * len(tables), columns, squeeze=False, sharey="row")
+    for number, table in enumerate(tables):
+        for row, regret in zip(grid[2 * number : 2 * number + 2], (False, True), strict=True):
+            for families, axes in zip(ERROR_PANELS, row[:-2], strict=True):
+                _draw_error_kinds(axes, table, families, table.distance, regret)
+                axes.set_title("" if regret else f"{table.task}: {' and '.join(families)}", loc="left", fontsize=10)
+            _draw_error_families(row[-2], table, PSNR, regret)
+            _draw_error_kinds(row[-1], table, ("control",), METRES, regret)
+            for axes, label in zip(row[-2:], ("PSNR, dB", "metres from the place"), strict=True):
+                axes.set_xlabel(label, fontsize=9)
+            row[0].set_ylabel("regret, less the oracle's" if regret else f"{table.label}, %", fontsize=9)
+    return figure
+
+
+def _draw_error_kinds(axes: Axes, table: ErrorTable, families: Sequence[str], measure: str, regret: bool) -> None:
+    """Draw a line for each kind of error in some families, from the oracle to its largest dose."""
+    lines = [line for line in table.lines if line.family in families and measure in line.measures]
+    ceiling = _prepare_error_axes(axes, table, regret)
+    axes.set_visible(bool(lines))
+    axes.set_xlabel(measure, fontsize=9)
+    for kind, color in zip(dict.fromkeys(line.kind for line in lines), (*PALETTE, INK), strict=False):
+        own = [line for line in lines if line.kind == kind]
+        points = [(line.measures[measure].value, found) for line in own if (found := _find_error_point(line, regret))]
+        if not points:
+            continue
+        x, y = [0.0, *(at for at, _ in points)], [ceiling, *(found.value for _, found in points)]
+        axes.plot(x, y, color=color, lw=1.2, alpha=0.8)
+        bars = np.array([[found.value - found.low, found.high - found.value] for _, found in points]).T
+        axes.errorbar(
+            x[1:], y[1:], np.clip(bars, 0, None), fmt="o", color=color, ms=4, elinewidth=1, alpha=0.8, label=kind
+        )
+    if lines and not regret:
+        axes.legend(frameon=False, labelcolor=INK, fontsize=8, ncols=2)
+
+
+def _draw_error_families(axes: Axes, table: ErrorTable, measure: str, regret: bool) -> None:
+    """Draw a dot for each arm, in the colour of its family."""
+    _prepare_error_axes(axes, table, regret)
+    for family in dict.fromkeys(line.family for line in table.lines):
+        own = [line for line in table.lines if line.family == family and measure in line.measures]
+        points = [(line.measures[measure].value, found) for line in own if (found := _find_error_point(line, regret))]
+        x, y = [at for at, _ in points], [found.value for _, found in points]
+        axes.plot(x, y, "o", color=FAMILY_COLORS[family], ms=5, alpha=0.8, label=family)
+    if table.lines and not regret:
+        axes.legend(frameon=False, labelcolor=INK, fontsize=8, ncols=2)
+
+
+def _prepare_error_axes(axes: Axes, table: ErrorTable, regret: bool) -> float:
+    """Draw the levels of the references; return that of the oracle."""
+    _style(axes)
+    ceiling = 0.0 if regret else table.references["oracle"].value
+    axes.axhline(ceiling, color=ROLE_COLORS["oracle"], lw=1, ls=(0, (4, 3)))
+    if not regret:
+        axes.axhline(table.references["none"].value, color=ROLE_COLORS["none"], lw=1, ls=":")
+    return ceiling
+
+
+def _find_error_point(line: ErrorLine, regret: bool) -> Any:
+    """Return the success of an arm, or its regret beyond the oracle's; None where it was not measured."""
+    if not regret:
+        return line.outcome
+    return None if line.regret is None else line.regret.estimate
 
 
 def blame_by_arm(found: Blame) -> Markup:

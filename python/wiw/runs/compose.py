@@ -4,10 +4,12 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 from wiw.errors import ArgumentError
+from wiw.experiments.errors import make_error
+from wiw.experiments.errors.erroneous import Erroneous
 from wiw.experiments.fidelity import FidelityObserver
 from wiw.experiments.gating import Gated
 from wiw.experiments.ground_truth import TruePlans, TrueScores, sort_stages
@@ -23,6 +25,7 @@ from wiw.loop.rollout_cache import cache_rollouts
 from wiw.registry import WORLD_MODELS
 from wiw.types import PRIMITIVES, Episode, Key
 from wiw.world_models.base import WorldModel
+from wiw.world_models.oracle import Oracle
 
 
 @dataclass(frozen=True)
@@ -45,6 +48,8 @@ class Experiment:
     """Stages that are given the ground truth."""
     semantics: Any = None
     """Source of semantics for models that need it."""
+    error: str | None = None
+    """KIND@DOSE of an error that imagined futures have; see `wiw.experiments.errors`."""
 
 
 def compose(spec: AgentSpec, experiment: Experiment, limits: Limits, context: RunContext) -> Agent:
@@ -58,7 +63,8 @@ def compose(spec: AgentSpec, experiment: Experiment, limits: Limits, context: Ru
     policy = AgentSpec(spec.policy, None, None, config, ()).build().policy
     placebo = None if "imagination" in stages else experiment.placebo
     model = make_for_space("oracle" if "imagination" in stages else spec.model, policy.space, limits.deadline)
-    imaginer = _wrap_model(model, policy.space, placebo, experiment, limits, context)
+    error = None if "imagination" in stages else experiment.error
+    imaginer = _wrap_model(model, policy.space, replace(experiment, placebo=placebo, error=error), limits, context)
     reviser = spec.reviser
     if reviser is None and not policy.can_revise:
         reviser = context.task.defaults.get("revision")
@@ -68,7 +74,9 @@ def compose(spec: AgentSpec, experiment: Experiment, limits: Limits, context: Ru
         reviser = TrueScores(reviser)
     if "proposals" in stages:
         policy = TruePlans(policy)
-    measured = [FidelityObserver(limits.lpips)] if limits.measures_fidelity else []
+    oracle = imaginer.model.unwrapped if imaginer is not None and imaginer.model is not None else None
+    truth = oracle if isinstance(oracle, Oracle) else None  # of the same size
+    measured = [FidelityObserver(limits.lpips, limits.fidelity_share, truth)] if limits.measures_fidelity else []
     observers = [*spec.observers, *measured]
     return Agent(policy, imaginer, reviser, config, observers=observers)
 
@@ -83,16 +91,17 @@ def make_for_space(model: Any, space: str, deadline: float = DEADLINE, **options
 def _wrap_model(
     model: WorldModel | Imaginer | None,
     space: str,
-    placebo: str | None,
     experiment: Experiment,
     limits: Limits,
     context: RunContext,
 ) -> Imaginer | None:
+    placebo = experiment.placebo
     if model is None:
-        if placebo is not None:
-            raise ArgumentError(f"placebo='{placebo}' needs a world model, and this agent has none")
+        for name in ("placebo", "error"):
+            if (given := getattr(experiment, name)) is not None:
+                raise ArgumentError(f"{name}='{given}' needs a world model, and this agent has none")
         return None
-    imaginer = model if isinstance(model, Imaginer) else ModelImaginer(_limit(model, limits))
+    imaginer = _make_imaginer(model, experiment.error, limits)
     if experiment.semantics is not None:
         imaginer = Labelled(imaginer, experiment.semantics)
     if placebo is not None:
@@ -100,6 +109,15 @@ def _wrap_model(
     if experiment.imagine_fraction is not None:
         imaginer = Gated(imaginer, experiment.imagine_fraction)
     return imaginer
+
+
+def _make_imaginer(model: WorldModel | Imaginer, error: str | None, limits: Limits) -> Imaginer:
+    if isinstance(model, Imaginer):
+        if error is not None:
+            raise ArgumentError(f"error='{error}' needs a world model, got a {type(model).__name__} that asks one")
+        return model
+    limited = _limit(model, limits)
+    return ModelImaginer(limited) if error is None else Erroneous(limited, make_error(error))
 
 
 def _limit(model: WorldModel, limits: Limits) -> WorldModel:

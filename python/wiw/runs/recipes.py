@@ -12,6 +12,8 @@ from typing import Any, cast
 from wiw.envs.base import Env
 from wiw.errors import ArgumentError
 from wiw.experiments.counterparts import is_counterpart
+from wiw.experiments.errors import make_error
+from wiw.experiments.errors.erroneous import require_error
 from wiw.experiments.placebos import PLACEBOS, require_words
 from wiw.loop.agent import Agent
 from wiw.loop.agent_spec import AgentSpec, space_option
@@ -34,6 +36,8 @@ PLACEBO, PLACEBO_MODEL = "placebo-", "warp"
 """What arms of placebos begin with, and the model that they are of where nobody names one."""
 RESEEDED = "reseeded"
 """Begins arms that repeat another with other random numbers: the noise floor."""
+ERROR, ERROR_MODEL = "error-", "oracle"
+"""What arms with an error begin with, and the model that they are of where nobody names one."""
 REFERENCES = ("none", "copy", "oracle")
 """Arms that reports know by name: no world model, floor and ceiling."""
 ELSEWHERE = ("vlm", "cache", "prices", "concurrency", "timeout", "attempts")
@@ -80,6 +84,8 @@ class AgentRecipe(AgentConfig):
     model: Any = None
     reviser: Any = None
     placebo: str | None = None
+    error: str | None = None
+    """KIND@DOSE of an error that the world model's futures have (`wiw.experiments.errors`)."""
     imagine_fraction: float | None = None
     model_options: Mapping[str, Any] = field(default_factory=dict)
     """What the world model is made with, by name."""
@@ -109,7 +115,7 @@ class AgentRecipe(AgentConfig):
         if semantics is not None and self.semantics_options:
             semantics = SEMANTICS.make(self.semantics, **self.semantics_options)
         policy, reviser = self._make_policies(space, context.task)
-        experiment = Experiment(self.placebo, self.imagine_fraction, tuple(self.ground_truth), semantics)
+        experiment = Experiment(self.placebo, self.imagine_fraction, tuple(self.ground_truth), semantics, self.error)
         return compose(
             AgentSpec(policy, model, reviser, self.config, tuple(self.observers)), experiment, limits, context
         )
@@ -145,6 +151,10 @@ class AgentRecipe(AgentConfig):
         """Return the same agent with a placebo of its world model (or of another one)."""
         own = PLACEBO_MODEL if self.model is None else self.model
         return replace(self.with_model(own if model is None else model), placebo=kind)
+
+    def with_error(self, error: str, model: Any = None) -> AgentRecipe:
+        """Return the same agent whose world model is the oracle (or another one) with an error."""
+        return replace(self.with_model(ERROR_MODEL if model is None else model), error=error)
 
     @property
     def is_named(self) -> bool:
@@ -215,6 +225,8 @@ class AgentRecipe(AgentConfig):
             require_placebo(self.placebo, self._find_space(task), episodes)
         if self.placebo == "blind" and (control := find_control(self.model)):
             require_words(control)
+        if self.error is not None:
+            require_error(make_error(self.error), self._find_space(task), _has_simulator(self.model))
         parts = ((WORLD_MODELS, self.model), (POLICIES, self.policy), (POLICIES, self.reviser))
         for registry, part in parts:
             found = registry.find(part) if isinstance(part, str) else part
@@ -296,6 +308,12 @@ def find_control(model: Any) -> str:
     """Return how a world model, or one of that name, is told plans; empty where only the model itself can say."""
     found = WORLD_MODELS.find(model) if isinstance(model, str) else model
     return str(getattr(getattr(found, "accepts", None), "control", ""))
+
+
+def _has_simulator(model: Any) -> bool:
+    """Return whether a world model, or one of that name, is handed the simulator; of the built-in ones oracle is."""
+    found = WORLD_MODELS.find(model) if isinstance(model, str) else model
+    return model == ERROR_MODEL or "simulator" in getattr(getattr(found, "accepts", None), "needs", ())
 
 
 def _describe(part: Any) -> Any:
@@ -438,16 +456,25 @@ def _make_arm(agent: AgentRecipe, name: str | None, model: Any) -> tuple[str, Ag
         raise ArgumentError(f"arms: '{model}' has the names '{name}' and '{arm.name}'; expected one of them")
     policy, of_model = _split_policy(arm.model)
     repeats, of_model = _split_repeat(of_model)
-    kind, named = placebo_of(of_model or "")
     own = agent if policy is None else agent.with_policy(policy)
-    changed = own.as_placebo(kind, named) if kind is not None else own if of_model is None else own.with_model(of_model)
+    changed = own if of_model is None else _change_model(own, of_model)
     changed = _with_options(replace(changed, reseed=1) if repeats else changed, arm)
     given = arm.name if name is None else name
-    if given in REFERENCES and (changed.arm != given or kind is not None or repeats):
+    is_changed = changed.placebo is not None or changed.error is not None or repeats
+    if given in REFERENCES and (changed.arm != given or is_changed):
         raise ArgumentError(
             f"arms: reports take the arm '{given}' for the reference '{given}', got {arm.model}; choose another name"
         )
     return given or _name_arm(policy, changed.arm if of_model is None else of_model, repeats), changed
+
+
+def _change_model(agent: AgentRecipe, text: str) -> AgentRecipe:
+    """Return the agent with the world model of an arm, or with a placebo or an error of it."""
+    kind, named = placebo_of(text)
+    if kind is not None:
+        return agent.as_placebo(kind, named)
+    error, named = error_of(text)
+    return agent.with_model(text) if error is None else agent.with_error(error, named)
 
 
 def _with_options(agent: AgentRecipe, arm: ArmText) -> AgentRecipe:
@@ -487,9 +514,10 @@ def _split_policy(name: str) -> tuple[str | None, str]:
 
 def _name_arm(policy: str | None, model: str, repeats: bool) -> str:
     kind, named = placebo_of(model)
+    error, named = (None, named) if kind is not None else error_of(model)
     short = AgentRecipe("", None if named in ("none", None) else named).arm
-    if kind is not None:
-        short = f"{PLACEBO}{kind}{f':{short}' if named else ''}"
+    if kind is not None or error is not None:
+        short = f"{f'{ERROR}{error}' if kind is None else f'{PLACEBO}{kind}'}{f':{short}' if named else ''}"
     if repeats:
         short = f"{RESEEDED}:{short}"
     return short if policy is None else policy if model == "none" and not repeats else f"{policy}+{short}"
@@ -510,6 +538,20 @@ def placebo_of(arm: str) -> tuple[str | None, str | None]:
     return kind, model or None
 
 
+def error_of(arm: str) -> tuple[str | None, str | None]:
+    """Return error and model of "error-blur@16:warp"; no model where it names none, no error for another arm.
+
+    Raises:
+        ArgumentError: an unknown kind of error, or a dose out of range.
+    """
+    if not arm.startswith(ERROR):
+        return None, arm
+    text, _, model = arm.removeprefix(ERROR).partition(":")
+    if model == "none":
+        raise ArgumentError(f"arms: expected {ERROR}KIND@DOSE[:MODEL], of a world model, got '{arm}'")
+    return str(make_error(text)), model or None
+
+
 def absolute(model: str) -> str:
     """`path.py:Class` with its path made absolute, so that it means the same in any folder; other names as they are."""
     repeats, named = _split_repeat(model)
@@ -518,5 +560,8 @@ def absolute(model: str) -> str:
     kind, named = placebo_of(model)
     if kind is not None and named is not None:
         return f"{PLACEBO}{kind}:{absolute(named)}"
+    error, named = error_of(model)
+    if error is not None:
+        return f"{ERROR}{error}{f':{absolute(named)}' if named else ''}"
     path, colon, name = model.rpartition(":")
     return f"{Path(path).expanduser().resolve()}:{name}" if colon and path.endswith(".py") else model

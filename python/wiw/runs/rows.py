@@ -144,6 +144,7 @@ def _fidelity(found: Fidelity, chosen: int | None) -> dict[str, Any]:
         "psnr": found.psnr,
         "ssim": found.ssim,
         **({} if found.lpips is None else {"lpips": found.lpips}),
+        **({} if found.pose_errors is None else {"pose_errors": found.pose_errors}),
     }
 
 

@@ -207,7 +207,7 @@ def _take_over(store: RunStore, settings: RunConfig) -> None:
     begun_with["shard"], now["shard"] = store.info.get("shard"), settings.shard
     begun_with["until"], now["until"] = store.info.get("until"), settings.looks
     try:
-        names = ("fidelity", "lpips", "shard", "until")
+        names = ("fidelity", "fidelity_share", "lpips", "shard", "until")
         store.require_same(*({name: each[name] for name in names} for each in (begun_with, now)))
     except StoreError:
         store.close()

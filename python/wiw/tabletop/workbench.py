@@ -179,6 +179,7 @@ class Workbench:
         self._world.set_joint_positions(self.robot.ready_joints, self._arm)
         self._buttons = tuple(thing.name for thing, _ in things if thing.lamp is not None)
         self._pressed: tuple[str, ...] = ()
+        self._offsets: Mapping[str, Pose] = {}
         self._scene_renderer = _SceneRenderer(self, backend)
 
     def fork(self, state: WorldState | None = None) -> Workbench:
@@ -192,6 +193,17 @@ class Workbench:
         other._world = self._world.fork()
         if state is not None:
             other._world.restore(state)
+        return other
+
+    def draw_elsewhere(self, offsets: Mapping[str, Pose]) -> Workbench:
+        """Return the same workbench, physics shared, that draws some objects elsewhere than they are.
+
+        Args:
+            offsets: transforms [4, 4] in the table's frame, by an object's name.
+        """
+        other = object.__new__(Workbench)
+        other.__dict__.update(self.__dict__)
+        other._offsets = dict(offsets)
         return other
 
     @property
@@ -372,6 +384,7 @@ class Workbench:
         bodies, arm = self._world.body_poses(), self._world.link_poses(self._arm)
         found: list[Pose] = []
         for name, thing in self.things.items():
+            first = len(found)
             if thing.mechanism is None:
                 found.append(bodies[self._bodies[name]] if thing.has_body else self._marks[name])
             else:
@@ -380,6 +393,8 @@ class Workbench:
             if thing.lamp is not None:
                 lit = self._find_lit_lamp(name)
                 found += [self.get_pose(name) if number == lit else LAMP_OFF_POSE for number in range(len(LAMPS))]
+            if name in self._offsets:
+                found[first:] = [self._offsets[name] @ pose for pose in found[first:]]
         return found + [arm[link] for link, _ in self.robot.link_meshes]
 
     def _find_lit_lamp(self, name: str) -> int | None:

@@ -5,6 +5,7 @@ from __future__ import annotations
 
 from collections import defaultdict
 from collections.abc import Sequence
+from dataclasses import replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -19,9 +20,24 @@ class Oracle(WorldModel):
 
     No model imagines better, so its score is the reference for what imagination is worth to a policy. It is no strict
     ceiling: a policy may succeed by chance where futures are wrong. It alone is handed the simulator.
+
+    Args:
+        size: height and width of its frames; 576x1024, or 480x480 before a table, where None. A policy that looks at
+            smaller frames loses nothing by less.
+
+    Raises:
+        ArgumentError: no size.
     """
 
     accepts = accepts(control="action", view="panorama", needs=("simulator",), causal=True, best_batch=64)
+
+    def __init__(self, size: Sequence[int] | None = None) -> None:
+        if size is None:
+            return
+        if len(size) != 2 or min(size) < 1:
+            raise ArgumentError(f"oracle: expected size [height, width] in pixels, got {size}")
+        self.size = int(size[0]), int(size[1])
+        self.accepts = replace(type(self).accepts, size=self.size)
 
     def rollout(
         self, observations: Conditioning, controls: Sequence[Control], seeds: NDArray[np.uint64]
@@ -65,14 +81,14 @@ class ArmOracle(Oracle):
         return frames
 
 
-def make_oracle(space: str = PRIMITIVES) -> Oracle:
+def make_oracle(space: str = PRIMITIVES, size: Sequence[int] | None = None) -> Oracle:
     """Carry each plan out in a fork of the simulator.
 
-    Return the model for plans of a space.
+    Return the model for plans of a space; `size` as for `Oracle`.
     """
     made = {PRIMITIVES: Oracle, GRIPPER_POSES: ArmOracle}.get(space)
     if made is None:
         raise ArgumentError(
             f"oracle: expected plans in {PRIMITIVES} or {GRIPPER_POSES}, got '{space}'; write one for yours"
         )
-    return made()
+    return made(size)

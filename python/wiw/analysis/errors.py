@@ -1,0 +1,323 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Costs of errors of known doses: success and regret of each arm against true futures, and of each family of errors.
+
+Every number is paired by episode with the oracle, whose futures have no error. A family's cost is a slope: the loss of
+its arms over how far their frames are from the true ones, fitted through the oracle, where both are zero.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass, replace
+from itertools import combinations
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from wiw.analysis.rank_correlation import Correlation, correlate
+from wiw.analysis.statistics import Difference, Estimate, adjust_p_values, compare, estimate_mean
+from wiw.analysis.summary import split_outcomes
+from wiw.experiments.errors import ERRORS
+from wiw.metrics.metric import ANSWER_SCORE, MEAN_TRAJECTORY, SUCCESS, Metric
+
+REGRET = Metric("regret", "Regret", "length", False, least=0.0)
+"""Score of the best true future less that of the chosen plan's, in the reviser's scores."""
+DISTANCES = ("LPIPS", "1 - SSIM")
+"""Distances of frames from the true ones; the first that is known is the one that costs are given for."""
+PSNR, METRES, DEGREES = "PSNR", "metres", "degrees"
+MEASURES = (*DISTANCES, PSNR, METRES, DEGREES)
+STEP = 0.1
+"""Distance that costs are given for."""
+FLOOR, CEILING = "none", "oracle"
+
+
+@dataclass(frozen=True)
+class ErrorLine:
+    """One error of one dose."""
+
+    arm: str
+    kind: str
+    family: str
+    dose: float
+    unit: str
+    outcome: Estimate
+    """Success rate, or score of answers, in percent."""
+    loss: Difference
+    """Arm minus oracle."""
+    actions: Difference | None
+    """The same in the number of actions."""
+    regret: Difference | None
+    """The same in regret."""
+    measures: Mapping[str, Estimate]
+    """How far the frames were from the true ones, by name of `MEASURES`; those that are known."""
+
+
+@dataclass(frozen=True)
+class Cost:
+    """What a family of errors costs for each `STEP` of a measure."""
+
+    family: str
+    measure: str
+    loss: Estimate
+    """Points of the outcome."""
+    regret: Estimate | None
+    arms: int
+
+
+@dataclass(frozen=True)
+class CostGap:
+    """The cost of one family less that of another one, paired by episode."""
+
+    family: str
+    base: str
+    measure: str
+    loss: Estimate
+    regret: Estimate | None
+
+
+@dataclass(frozen=True)
+class ErrorTable:
+    """All numbers of one task."""
+
+    task: str
+    policy: str
+    label: str
+    """Of the outcome: "SR" or "Score"."""
+    episodes: int
+    """Scored in every arm."""
+    scenes: int
+    references: Mapping[str, Estimate]
+    """Outcome of "none" and "oracle"."""
+    gain: Difference | None
+    """The oracle minus none: what there is to lose."""
+    lines: tuple[ErrorLine, ...]
+    costs: tuple[Cost, ...]
+    gaps: tuple[CostGap, ...]
+    correlations: tuple[Correlation, ...]
+    """How well each measure orders the arms by the outcome."""
+    left_out: tuple[str, ...]
+    """Kinds of errors that make no sense in this task."""
+
+    @property
+    def distance(self) -> str:
+        """The distance of frames that costs are given for."""
+        known = {name for line in self.lines for name in line.measures}
+        return next(name for name in DISTANCES if name in known)
+
+
+def summarise_errors(
+    task: str,
+    policy: str,
+    outcomes: Sequence[Mapping[str, Any]],
+    decisions: Iterable[Mapping[str, Any]],
+    arms: Mapping[str, tuple[str, float]],
+    left_out: Sequence[str] = (),
+    seed: int = 0,
+) -> ErrorTable:
+    """Return what each error costs.
+
+    Args:
+        task: its name.
+        policy: its name.
+        outcomes: ended episodes of all arms, as the run store has them.
+        decisions: "arm", "episode" and "fidelity" of decisions; those without fidelity are passed over.
+        arms: kind and dose of each arm with an error.
+        left_out: kinds of errors without arms here.
+        seed: of the bootstrap.
+    """
+    names = [FLOOR, CEILING, *arms]
+    done, _ = split_outcomes(names, [row for row in outcomes if row["arm"] in names])
+    measured = _average_by_episode(decisions)
+    _add_regret(done, measured)
+    shown = [arm for arm in arms if done[arm] and done[CEILING]]
+    scored = set.intersection(*(set(done[arm]) for arm in (FLOOR, CEILING, *shown)))
+    metric = next(
+        metric
+        for metric in (SUCCESS, ANSWER_SCORE)
+        if all(metric.name in row["metrics"] for own in done.values() for row in own.values())
+    )
+    lines = _adjust([_line(arm, *arms[arm], done, measured, metric, seed) for arm in shown])
+    pooled = _Pooled(shown, sorted(scored), done, measured, metric, seed)
+    costs, gaps = _list_costs(lines, pooled)
+    return ErrorTable(
+        task,
+        policy,
+        metric.label,
+        len(scored),
+        len({done[CEILING][index]["scene"] for index in scored}),
+        {arm: _estimate(done[arm], metric, seed) for arm in (FLOOR, CEILING)},
+        compare(CEILING, FLOOR, done, metric, seed),
+        lines,
+        costs,
+        gaps,
+        pooled.correlate_measures(),
+        tuple(left_out),
+    )
+
+
+Done = Mapping[str, Mapping[int, Mapping[str, Any]]]
+Measured = Mapping[str, Mapping[int, Mapping[str, float]]]
+
+
+def _average_by_episode(decisions: Iterable[Mapping[str, Any]]) -> dict[str, dict[int, dict[str, float]]]:
+    """Return the means over an episode's measured decisions and their plans: by arm, episode and measure."""
+    found: dict[str, dict[int, dict[str, list[float]]]] = {}
+    for row in decisions:
+        if row["fidelity"] is None:
+            continue
+        own = found.setdefault(row["arm"], {}).setdefault(row["episode"], {})
+        for name, values in _read_fidelity(row["fidelity"]).items():
+            own.setdefault(name, []).extend(value for value in values if value is not None and math.isfinite(value))
+    return {
+        arm: {
+            episode: {name: float(np.mean(values)) for name, values in own.items() if values}
+            for episode, own in episodes.items()
+        }
+        for arm, episodes in found.items()
+    }
+
+
+def _read_fidelity(found: Mapping[str, Any]) -> dict[str, Sequence[float | None]]:
+    """Return the measures of a decision's plans, as a store has them."""
+    poses = found.get("pose_errors") or ()
+    return {
+        "LPIPS": found.get("lpips", ()),
+        "1 - SSIM": [None if value is None else 1 - value for value in found["ssim"]],
+        PSNR: found["psnr"],
+        METRES: [metres for metres, _ in poses],
+        DEGREES: [degrees for _, degrees in poses],
+        REGRET.name: [found["regret"]],
+    }
+
+
+def _add_regret(done: dict[str, dict[int, Mapping[str, Any]]], measured: Measured) -> None:
+    """Add the mean regret of each episode to its metrics, where it was measured."""
+    for arm, rows in done.items():
+        for index, row in rows.items():
+            regret = measured.get(arm, {}).get(index, {}).get(REGRET.name)
+            if regret is not None:
+                rows[index] = {**row, "metrics": {**row["metrics"], REGRET.name: regret}}
+
+
+def _estimate(done: Mapping[int, Mapping[str, Any]], metric: Metric, seed: int) -> Estimate:
+    values = [row["metrics"][metric.name] for row in done.values()]
+    return estimate_mean(values, [row["scene"] for row in done.values()], metric, seed=seed)
+
+
+def _line(arm: str, kind: str, dose: float, done: Done, measured: Measured, metric: Metric, seed: int) -> ErrorLine:
+    loss = compare(arm, CEILING, done, metric, seed)
+    assert loss is not None
+    measures = {}
+    for name in MEASURES:
+        known = {index: own[name] for index, own in measured.get(arm, {}).items() if name in own and index in done[arm]}
+        if known:
+            scenes = [done[arm][index]["scene"] for index in known]
+            least = 0.0 if name != PSNR else -math.inf
+            measures[name] = estimate_mean(
+                list(known.values()), scenes, Metric(name, name, "length", False, least=least), seed=seed
+            )
+    return ErrorLine(
+        arm,
+        kind,
+        ERRORS[kind].family,
+        dose,
+        ERRORS[kind].unit,
+        _estimate(done[arm], metric, seed),
+        loss,
+        compare(arm, CEILING, done, MEAN_TRAJECTORY, seed),
+        compare(arm, CEILING, done, REGRET, seed),
+        measures,
+    )
+
+
+def _adjust(lines: Sequence[ErrorLine]) -> tuple[ErrorLine, ...]:
+    """Return the lines with p values adjusted for all arms."""
+    adjusted = adjust_p_values([line.loss for line in lines])
+    return tuple(replace(line, loss=loss) for line, loss in zip(lines, adjusted, strict=True))
+
+
+class _Pooled:
+    """Arms on the episodes that are scored in all of them, as matrices [arms, episodes]."""
+
+    def __init__(
+        self, arms: Sequence[str], episodes: Sequence[int], done: Done, measured: Measured, metric: Metric, seed: int
+    ) -> None:
+        self._arms, self._seed, self._scale = list(arms), seed, metric.scale
+        self._scenes = [done[CEILING][index]["scene"] for index in episodes]
+        self._outcome = self._read(arms, episodes, lambda arm, index: done[arm][index]["metrics"][metric.name])
+        self._lost = (
+            self._read([CEILING], episodes, lambda arm, index: done[arm][index]["metrics"][metric.name]) - self._outcome
+        )
+        get = lambda arm, index: done[arm][index]["metrics"].get(REGRET.name, math.nan)  # noqa: E731
+        self._regret = self._read(arms, episodes, get) - self._read([CEILING], episodes, get)
+        self._measures = {
+            name: self._read(
+                arms, episodes, lambda arm, index, name=name: measured.get(arm, {}).get(index, {}).get(name, math.nan)
+            )
+            for name in MEASURES
+        }
+
+    @staticmethod
+    def _read(arms: Sequence[str], episodes: Sequence[int], get: Any) -> NDArray[np.float64]:
+        return np.array([[get(arm, index) for index in episodes] for arm in arms], np.float64).reshape(
+            len(arms), len(episodes)
+        )
+
+    def weigh(self, arms: Sequence[str], measure: str) -> NDArray[np.float64] | None:
+        """Return weights [arms] that make the slope through the origin of what arms lose; None without any distance."""
+        rows = [self._arms.index(arm) for arm in arms]
+        values = self._measures[measure][rows]
+        if not rows or not values.size or np.isnan(values).all(axis=1).any():
+            return None
+        x = np.nanmean(values, axis=1)
+        weights = np.zeros(len(self._arms))
+        total = float((x**2).sum())
+        if total <= 0:
+            return None
+        weights[rows] = STEP * x / total
+        return weights
+
+    def estimate_loss(self, weights: NDArray[np.float64]) -> Estimate | None:
+        """Return the weighted sum of what the arms lose, in points; None without episodes."""
+        return self._estimate_mean(self._scale * (weights @ self._lost))
+
+    def estimate_regret(self, weights: NDArray[np.float64]) -> Estimate | None:
+        """Return the weighted sum of what the arms gain in regret, over episodes in which it was measured in all."""
+        used = weights != 0
+        return self._estimate_mean(weights[used] @ self._regret[used])
+
+    def _estimate_mean(self, values: NDArray[np.float64]) -> Estimate | None:
+        known = np.isfinite(values)
+        if not known.any():
+            return None
+        scenes = [scene for scene, each in zip(self._scenes, known, strict=True) if each]
+        return estimate_mean(values[known], scenes, Metric("cost", "cost", "length", False), seed=self._seed)
+
+    def correlate_measures(self) -> tuple[Correlation, ...]:
+        """Return how well each measure orders the arms by the outcome."""
+        known = [
+            name for name in MEASURES if self._outcome.size and np.isfinite(self._measures[name]).any(axis=1).all()
+        ]
+        return tuple(correlate(name, self._outcome, self._measures[name], self._scenes, self._seed) for name in known)
+
+
+def _list_costs(lines: Sequence[ErrorLine], pooled: _Pooled) -> tuple[tuple[Cost, ...], tuple[CostGap, ...]]:
+    families = list(dict.fromkeys(line.family for line in lines))
+    costs, gaps = [], []
+    for measure in (*DISTANCES, METRES):
+        weights = {
+            family: pooled.weigh([line.arm for line in lines if line.family == family], measure) for family in families
+        }
+        known = {family: own for family, own in weights.items() if own is not None}
+        for family, own in known.items():
+            loss = pooled.estimate_loss(own)
+            if loss is not None:
+                costs.append(Cost(family, measure, loss, pooled.estimate_regret(own), int((own != 0).sum())))
+        for base, family in combinations(known, 2) if measure != METRES else ():
+            apart = known[family] - known[base]
+            loss = pooled.estimate_loss(apart)
+            if loss is not None:
+                gaps.append(CostGap(family, base, measure, loss, pooled.estimate_regret(apart)))
+    return tuple(costs), tuple(gaps)

@@ -1,0 +1,90 @@
+# SPDX-License-Identifier: Apache-2.0
+"""What an error of imagined futures is, and how one of a known dose is written: KIND@DOSE, such as `blur@16`."""
+
+from __future__ import annotations
+
+from abc import ABC, abstractmethod
+from collections.abc import Mapping, Sequence
+from typing import ClassVar, Literal
+
+import numpy as np
+from numpy.typing import NDArray
+
+from wiw._core import core
+from wiw.errors import ArgumentError
+from wiw.types import GRIPPER_POSES, PRIMITIVES, Conditioning, Control
+from wiw.world_models.base import WorldModel
+
+Family = Literal["looks", "flicker", "control", "content"]
+_PURPOSE = 0x6572726F
+"""Keeps these draws apart from all others of a rollout."""
+
+
+class Degradation(ABC):
+    """An error of imagined futures, of a known dose. A dose of 0 changes nothing.
+
+    All draws are by the seed of a rollout, and nested: what a dose does, a larger one does too.
+
+    Args:
+        dose: from 0, in `unit`.
+
+    Raises:
+        ArgumentError: a dose out of range.
+    """
+
+    kind: ClassVar[str]
+    family: ClassVar[Family]
+    about: ClassVar[str]
+    """A sentence that begins with a verb: what a dose does to a future."""
+    unit: ClassVar[str]
+    """Unit of the dose."""
+    doses: ClassVar[Mapping[str, tuple[float, ...]]]
+    """Doses of a study, from small to large, by plan space; the error makes no sense in other plan spaces."""
+    most: ClassVar[float] = np.inf
+    """Largest dose."""
+    draws_future: ClassVar[bool] = False
+    """Whether something is drawn for a whole future, so that futures cannot share the frames of a common beginning."""
+    needs_simulator: ClassVar[bool] = True
+    """Whether it acts on the fork of the simulator that only the oracle is handed."""
+
+    def __init__(self, dose: float) -> None:
+        if not 0 <= dose <= self.most:
+            largest = "" if np.isinf(self.most) else f" to {self.most:g}"
+            raise ArgumentError(f"error '{self.kind}': expected a dose from 0{largest} ({self.unit}), got {dose:g}")
+        self.dose = float(dose)
+
+    def __str__(self) -> str:
+        return f"{self.kind}@{self.dose:g}"
+
+    @abstractmethod
+    def rollout(
+        self,
+        model: WorldModel,
+        observations: Conditioning,
+        controls: Sequence[Control],
+        seeds: NDArray[np.uint64],
+    ) -> NDArray[np.uint8]:
+        """Return the model's frames with this error; see `WorldModel.rollout`."""
+
+    def misplace(self, simulator: object, actions: NDArray[np.generic], seed: int) -> NDArray[np.float64]:
+        """Return how far each frame is from where it should have been taken, float64 [K, 2]: metres and degrees.
+
+        Of the camera in plans of primitives, of the gripper in plans of poses. Default: nowhere else.
+
+        Args:
+            simulator: fork of the environment from which the plan is imagined.
+            actions: the plan, K actions.
+            seed: of the rollout.
+        """
+        return np.zeros((len(actions), 2))
+
+
+def per_space(primitives: tuple[float, ...], poses: tuple[float, ...] | None = None) -> Mapping[str, tuple[float, ...]]:
+    """Return doses by plan space: `poses` None means the same, and empty that the error makes no sense there."""
+    found = {PRIMITIVES: primitives, GRIPPER_POSES: primitives if poses is None else poses}
+    return {space: doses for space, doses in found.items() if doses}
+
+
+def make_generator(seed: int, *parts: int) -> np.random.Generator:
+    """Return the generator of a rollout's draws; `parts` tell several of one rollout apart."""
+    return np.random.Generator(np.random.Philox(key=core.fold_key([int(seed), _PURPOSE, *parts])))

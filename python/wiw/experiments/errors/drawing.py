@@ -1,0 +1,119 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Pictures of a world that is drawn otherwise than it is: instances elsewhere, or copies of them beside the originals.
+
+Everything that draws a scene shares its renderer, so instances are moved for the time of one call and then put back.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
+from typing import Any
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from wiw.tabletop.workbench import Workbench
+
+
+class MovedRenderer:
+    """A renderer that draws some instances elsewhere.
+
+    Args:
+        renderer: the compiled one (`wiw.render.Renderer.core`).
+        ids: uint32 [N] instances that are moved.
+        poses: float32 [N, 4, 4] where they are drawn.
+        originals: float32 [N, 4, 4] where they are.
+    """
+
+    def __init__(
+        self, renderer: Any, ids: NDArray[np.uint32], poses: NDArray[np.float32], originals: NDArray[np.float32]
+    ) -> None:
+        self._renderer, self._ids, self._poses, self._originals = renderer, ids, poses, originals
+
+    def panorama(self, poses: ArrayLike, size: tuple[int, int], color: Any, depth: Any, instance: Any) -> None:
+        """Render panoramas as `wiw._core.render.Renderer.panorama` does."""
+        with self._moved():
+            self._renderer.panorama(poses, size, color, depth, instance)
+
+    @contextmanager
+    def _moved(self) -> Iterator[None]:
+        if len(self._ids):
+            self._renderer.set_poses(self._ids, self._poses)
+        try:
+            yield
+        finally:
+            if len(self._ids):
+                self._renderer.set_poses(self._ids, self._originals)
+
+
+class ComposedRenderer:
+    """A renderer that draws a world as it is, and over it copies of some instances, behind what hides them.
+
+    Args:
+        renderer: the compiled one.
+        moved: draws the same world with these instances where their copies are.
+        ids: uint32 [N] the instances.
+    """
+
+    def __init__(self, renderer: Any, moved: MovedRenderer, ids: NDArray[np.uint32]) -> None:
+        self._renderer, self._moved, self._ids = renderer, moved, ids
+
+    def panorama(self, poses: ArrayLike, size: tuple[int, int], color: Any, depth: Any, instance: Any) -> None:
+        """Render color panoramas, uint8 [B, H, W, 3]."""
+        shape = color.shape[:3]
+        true, there = np.empty(shape, np.float32), np.empty(shape, np.float32)
+        copies, ids = np.empty_like(color), np.empty(shape, np.uint32)
+        self._renderer.panorama(poses, size, color, true, None)
+        self._moved.panorama(poses, size, copies, there, ids)
+        paste_copies(color, true, copies, there, np.isin(ids, self._ids))
+
+
+class DrawnBench:
+    """A workbench some of whose things are drawn elsewhere, or twice, while its physics stays true.
+
+    Args:
+        bench: the workbench.
+        offsets: transforms [4, 4] in the world's frame, by a thing's name.
+        copies: whether things are also drawn where they are.
+    """
+
+    def __init__(self, bench: Workbench, offsets: Mapping[str, NDArray[np.float64]], copies: bool = False) -> None:
+        self._bench, self._offsets, self._copies = bench, offsets, copies
+
+    def fork(self) -> DrawnBench:
+        """Return a copy that moves on its own."""
+        return DrawnBench(self._bench.fork(), self._offsets, self._copies)
+
+    def render_fronts_after(self, poses: ArrayLike, size: tuple[int, int]) -> NDArray[np.uint8]:
+        """Move to each of the poses [K, 7] in turn; return the front view after each, uint8 [K, H, W, 3]."""
+        views = []
+        for pose in np.asarray(poses, np.float64):
+            self._bench.move_to(pose)
+            views.append(self._render_front(size))
+        return np.stack(views)
+
+    def _render_front(self, size: tuple[int, int]) -> NDArray[np.uint8]:
+        drawn = self._bench.draw_elsewhere(self._offsets)
+        if not self._copies:
+            return np.asarray(drawn.render_view("front", size)["color"])
+        true = self._bench.render_view("front", size, ("color", "depth"))
+        copies = drawn.render_view("front", size, ("color", "depth", "instance"))
+        ids = 1 + np.flatnonzero(np.isin(drawn.instance_names, list(self._offsets)))
+        paste_copies(true["color"], true["depth"], copies["color"], copies["depth"], np.isin(copies["instance"], ids))
+        return true["color"]
+
+
+def paste_copies(
+    picture: NDArray[np.uint8],
+    depth: NDArray[np.float32],
+    copies: NDArray[np.uint8],
+    copy_depth: NDArray[np.float32],
+    shown: NDArray[np.bool_],
+) -> None:
+    """Paint copies into a picture [..., 3] in place, where they are shown and nearer than what is there.
+
+    A depth of 0 means that nothing is hit.
+    """
+    nearer = shown & ((copy_depth < depth) | (depth == 0))
+    picture[nearer] = copies[nearer]

@@ -1,0 +1,177 @@
+# SPDX-License-Identifier: Apache-2.0
+"""A study of errors as tables and sentences, for the terminal and for the page."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping, Sequence
+
+from rich.console import Console
+from rich.text import Text
+
+from wiw.analysis.errors import METRES, PSNR, STEP, Cost, CostGap, ErrorLine, ErrorTable
+from wiw.analysis.statistics import Difference, Estimate
+from wiw.analysis.summary import show_estimate, show_p
+from wiw.experiments.errors import ERRORS
+from wiw.report.quality_tables import RANK_TITLES, show_rank
+from wiw.report.tables import ROOMY, print_stacked
+
+ABOUT: Mapping[str, str] = {
+    "minus oracle": "Paired difference from the same agent with true futures, in points.",
+    "p": "Exact McNemar test of this difference, adjusted by Holm for all arms.",
+    "regret": "Reviser's score of the best true future less that of the chosen plan's; minus the oracle's.",
+    "actions": "Executed actions per episode, minus the oracle's.",
+    "1 - SSIM": "Dissimilarity of imagined and true frames, as the reviser sees them.",
+    "LPIPS": "Perceptual distance of imagined and true views of 256x256 pixels.",
+    "PSNR": "Of imagined and true frames, dB; 100 for equal ones.",
+    "metres": "How far the imagined camera, or gripper, was from its place.",
+}
+COST_TITLES = ("points lost", "regret", "arms")
+GAP_TITLES = ("points", "regret")
+
+
+def list_titles(table: ErrorTable) -> list[str]:
+    """Return the titles of the table of arms."""
+    return [table.label, "minus oracle", "p", "regret", "actions", *_list_measures(table)]
+
+
+def list_lines(table: ErrorTable) -> list[tuple[str, list[str]]]:
+    """Return name and cells of each arm, under `list_titles`."""
+    empty = [""] * (len(list_titles(table)) - 1)
+    references = [(arm, [show_estimate(found), *empty]) for arm, found in table.references.items()]
+    return [*references, *((line.arm, _show_line(line, table)) for line in table.lines)]
+
+
+def list_costs(table: ErrorTable) -> list[tuple[str, list[str]]]:
+    """Return name and cells of what each family costs, under `COST_TITLES`."""
+    return [
+        (
+            f"{each.family}, per {_name_step(each.measure)}",
+            [show_estimate(each.loss), _show(each.regret), f"{each.arms}"],
+        )
+        for each in table.costs
+    ]
+
+
+def list_gaps(table: ErrorTable) -> list[tuple[str, list[str]]]:
+    """Return name and cells of the differences between families, under `GAP_TITLES`."""
+    return [
+        (
+            f"{each.family} - {each.base}, per {_name_step(each.measure)}",
+            [show_estimate(each.loss, signed=True), _show(each.regret)],
+        )
+        for each in table.gaps
+    ]
+
+
+def list_correlations(table: ErrorTable) -> list[tuple[str, list[str]]]:
+    """Return name and cells of how each measure orders the arms by the outcome, under `RANK_TITLES`."""
+    return [(each.measure, show_rank(each)) for each in table.correlations]
+
+
+def describe_doses(tables: Sequence[ErrorTable]) -> list[tuple[str, str, str]]:
+    """Return kind, unit and meaning of each error."""
+    kinds = dict.fromkeys(line.kind for table in tables for line in table.lines)
+    return [(kind, ERRORS[kind].unit, ERRORS[kind].about) for kind in kinds]
+
+
+def explain(table: ErrorTable) -> list[str]:
+    """Return what a task's numbers say, in sentences."""
+    gain = table.gain
+    found = []
+    if gain is not None:
+        sure = "" if gain.estimate.excludes_zero else ", which may be chance: little can be lost that was not won"
+        found.append(f"True futures bring {show_estimate(gain.estimate, signed=True)} points over none{sure}.")
+    costs = [each for each in table.costs if each.measure == table.distance]
+    found += [_tell_cost(each, table.label) for each in costs]
+    found += [_tell_gap(each) for each in table.gaps if each.measure == table.distance]
+    found += [_tell_cost(each, table.label) for each in table.costs if each.measure == METRES]
+    if lost := [line for line in table.lines if _is_loss(line)]:
+        found.append(
+            "Below the oracle beyond chance, adjusted for all arms: " + ", ".join(line.arm for line in lost) + "."
+        )
+    else:
+        found.append("No single arm is below the oracle beyond chance, adjusted for all arms.")
+    if table.left_out:
+        found.append(f"Left out, for they make no sense in {table.task}: {', '.join(table.left_out)}.")
+    found.append(
+        f"{table.episodes} episodes in {table.scenes} scenes, policy {table.policy}; costs are over the episodes that "
+        "are scored in all arms. Intervals: 95 %, over scenes. A cost assumes losses in proportion to distance."
+    )
+    return found
+
+
+def print_errors(tables: Sequence[ErrorTable]) -> None:
+    """Print all tables and what they say."""
+    console = Console()
+    console = Console(width=None if console.is_terminal else max(console.width, ROOMY))
+    for table in tables:
+        for title, titles, rows, heading in (
+            (f"{table.task}: errors of known doses", list_titles(table), list_lines(table), "arm"),
+            ("What a family of errors costs", COST_TITLES, list_costs(table), "family"),
+            ("One family less another", GAP_TITLES, list_gaps(table), "families"),
+            (f"Rank correlation with {table.label} over arms", RANK_TITLES, list_correlations(table), "measure"),
+        ):
+            print_stacked(title, [name for name, _ in rows], titles, [cells for _, cells in rows], heading)
+        for line in explain(table):
+            console.print(Text(line, style="dim"))
+
+
+def _list_measures(table: ErrorTable) -> list[str]:
+    known = {name for line in table.lines for name in line.measures}
+    return [name for name in (table.distance, PSNR, METRES) if name in known]
+
+
+def _show_line(line: ErrorLine, table: ErrorTable) -> list[str]:
+    forms = {PSNR: ".1f"}
+    measures = [
+        f"{line.measures[name].value:{forms.get(name, '.3f')}}" if name in line.measures else "–"
+        for name in _list_measures(table)
+    ]
+    return [
+        show_estimate(line.outcome),
+        show_estimate(line.loss.estimate, signed=True),
+        show_p(line.loss.p_adjusted),
+        _show_difference(line.regret, ".3f"),
+        _show_difference(line.actions, ".1f"),
+        *measures,
+    ]
+
+
+def _show_difference(found: Difference | None, form: str) -> str:
+    return "–" if found is None else _show(found.estimate, form)
+
+
+def _show(found: Estimate | None, form: str = ".3f") -> str:
+    """Return e.g. "+0.041 [0.012, 0.070]"; "–" where it is not known."""
+    if found is None or math.isnan(found.value):
+        return "–"
+    return f"{found.value:+{form}} [{found.low:{form}}, {found.high:{form}}]"
+
+
+def _name_step(measure: str) -> str:
+    return f"{STEP:g} m" if measure == METRES else f"{STEP:g} in {measure}"
+
+
+def _is_loss(line: ErrorLine) -> bool:
+    p_value = line.loss.p_adjusted
+    return p_value is not None and p_value <= 0.05 and line.loss.estimate.value < 0
+
+
+def _tell_cost(found: Cost, label: str) -> str:
+    sure = "" if found.loss.excludes_zero else ", which may be chance"
+    return (
+        f"Errors of {found.family} cost {show_estimate(found.loss)} points of {label} per {_name_step(found.measure)} "
+        f"({found.arms} {'arm' if found.arms == 1 else 'arms'}){sure}."
+    )
+
+
+def _tell_gap(found: CostGap) -> str:
+    if not found.loss.excludes_zero:
+        verdict = "undecided"
+    else:
+        verdict = f"{found.family if found.loss.value > 0 else found.base} costs more"
+    return (
+        f"At an equal distance, {found.family} less {found.base}: {show_estimate(found.loss, signed=True)} points per "
+        f"{_name_step(found.measure)}: {verdict}."
+    )

@@ -1,0 +1,245 @@
+# SPDX-License-Identifier: Apache-2.0
+"""What kind of error costs success? The oracle's true futures are made worse by known doses, and success is measured.
+
+The paper finds that success follows controllability rather than visual quality, over a dozen models that differ in
+both and in everything else. Here one thing is changed at a time, in futures that are true otherwise, so that a loss of
+success is due to the error and nothing else (`wiw.experiments.errors`).
+"""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Callable, Mapping, Sequence
+from contextlib import ExitStack
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import Any
+
+from wiw.analysis.errors import ErrorTable, summarise_errors
+from wiw.errors import ArgumentError
+from wiw.experiments.errors import ERRORS
+from wiw.metrics import Lpips
+from wiw.registry import task_class
+from wiw.runs.recipes import ERROR, AgentRecipe, TaskRecipe
+from wiw.runs.rows import to_json
+from wiw.runs.shards import Shard
+from wiw.studies.evaluate import evaluate
+from wiw.studies.run_log import load_run
+from wiw.types import PRIMITIVES
+
+TASKS = ("imagenav", "ar", "aeqa", "manipulation")
+FLOOR, CEILING = "none", "oracle"
+"""Arms beside those with errors: no imagination, and true futures."""
+BLOCK = 8
+"""Episodes of one part of a run, in which every arm is run before the next part begins."""
+
+Watch = Callable[[str, int, int, str], None]
+"""Called with what is done, how much of it, out of how much, and a text."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class ErrorSettings:
+    """What a user of the study chooses.
+
+    Raises:
+        ArgumentError: a number out of range, or an unknown task or kind of error.
+    """
+
+    tasks: tuple[str, ...] = TASKS
+    kinds: tuple[str, ...] = tuple(ERRORS)
+    """Kinds of errors; those that make no sense in a task are left out there, and named."""
+    doses: int = 3
+    """How many doses of each kind, the largest ones of `FutureError.doses`."""
+    episodes: int = 100
+    """Of each task."""
+    seed: int = 0
+    scenes: str | None = None
+    """Of tasks in which an agent walks; the task's own if None."""
+    per_scene: int = 2
+    """Episodes in a scene, of tasks in which an agent walks."""
+    policy: str | None = None
+    """The task's own if None."""
+    size: tuple[int, int] | None = None
+    """Height and width of the oracle's frames; its own if None."""
+    fidelity_share: float = 0.25
+    """Share of the decisions at which frames and scores are compared with the true ones."""
+
+    def __post_init__(self) -> None:
+        for name, known in (("tasks", TASKS), ("kinds", tuple(ERRORS))):
+            given = getattr(self, name)
+            if not given or len(set(given)) < len(given) or not set(given) <= set(known):
+                raise ArgumentError(f"errors: expected different {name} among {', '.join(known)}, got {list(given)}")
+        if not 1 <= self.doses <= 3 or min(self.episodes, self.per_scene) < 1:
+            raise ArgumentError(
+                f"errors: expected 1 to 3 doses and 1 or more episodes, in all and in a scene, got {self.doses}, "
+                f"{self.episodes} and {self.per_scene}"
+            )
+
+    def list_arms(self, task: str) -> dict[str, tuple[str, float]]:
+        """Return kind and dose of the arms of a task that have an error, by arm."""
+        space = getattr(task_class(task), "space", PRIMITIVES)
+        found = [(kind, dose) for kind in self.kinds for dose in ERRORS[kind].doses.get(space, ())[-self.doses :]]
+        return {f"{ERROR}{kind}@{dose:g}": (kind, dose) for kind, dose in found}
+
+    def list_left_out(self, task: str) -> list[str]:
+        """Return the kinds that make no sense in a task."""
+        chosen = {kind for kind, _ in self.list_arms(task).values()}
+        return [kind for kind in self.kinds if kind not in chosen]
+
+
+FULL = ErrorSettings()
+SMALL = ErrorSettings(
+    tasks=("imagenav",), kinds=("blur", "flicker", "ignored", "moved"), doses=2, episodes=8, size=(144, 256)
+)
+"""About three minutes on two cores."""
+
+
+@dataclass(frozen=True)
+class ErrorStudy:
+    """The result of `wiw.study_errors`."""
+
+    tables: tuple[ErrorTable, ...]
+    """One a task."""
+    settings: ErrorSettings
+    out: Path
+    """Folder of the study, which `save` writes into."""
+
+    def summary(self) -> None:
+        """Print the tables and what they say."""
+        from wiw.report.error_tables import print_errors
+
+        print_errors(self.tables)
+
+    def to_json(self) -> str:
+        """Return the numbers as JSON."""
+        found = {"settings": asdict(self.settings), "tasks": [asdict(table) for table in self.tables]}
+        return json.dumps(json.loads(to_json(found)), indent=2)
+
+    def save(self) -> list[Path]:
+        """Write errors.html, .svg, .png and .json into `out`, and return their paths."""
+        from wiw.report.error_page import write_errors
+
+        return write_errors(self.tables, asdict(self.settings), self.to_json(), self.out)
+
+
+def study_errors(
+    out: str | Path = "runs/errors",
+    settings: ErrorSettings = FULL,
+    *,
+    workers: int = 1,
+    lpips: str | Path | None = None,
+    watch: Watch = lambda *_: None,
+) -> ErrorStudy:
+    """Run the oracle with errors of known doses on the same episodes, and measure what each costs.
+
+        found = wiw.study_errors("runs/errors", workers=4)
+        found.summary()
+        found.save()
+
+    The same call goes on where an earlier one was stopped, episode by episode. Runs are ordinary ones, a part of the
+    episodes each: `wiw merge runs/errors/imagenav` makes one of them, `wiw report` and `wiw view` show it.
+
+    Args:
+        out: folder of the study, with a folder of runs for each task.
+        settings: tasks, errors, doses and episodes; `wiw.studies.errors.SMALL` is the small version.
+        workers: processes; results do not depend on it.
+        lpips: folder of the weights of LPIPS, or "auto", to measure it besides PSNR and SSIM.
+        watch: called with progress.
+
+    Raises:
+        ArgumentError: a number out of range, or a policy that does not fit a task.
+        StoreError: the folder holds a study with other settings.
+        WeightsError: those of LPIPS are not there.
+    """
+    if lpips is not None:
+        Lpips(lpips)  # fails before anything takes time
+    folder = Path(out)
+    tables = []
+    for task in settings.tasks:
+        done = _run_task(task, settings, folder / task, workers, lpips, watch)
+        tables.append(_read_task(task, settings, done))
+    return ErrorStudy(tuple(tables), settings, folder)
+
+
+def read_errors(out: str | Path, settings: ErrorSettings = FULL) -> ErrorStudy:
+    """Return the study in a folder as far as it has come, running nothing.
+
+    Args:
+        out: folder of the study.
+        settings: that it was begun with; tasks without any run are left out.
+    """
+    folder = Path(out)
+    parts = {task: sorted(path.parent for path in (folder / task).glob("*/run.sqlite")) for task in settings.tasks}
+    found = tuple(_read_task(task, settings, own) for task, own in parts.items() if own)
+    return ErrorStudy(found, settings, folder)
+
+
+def _run_task(
+    task: str, settings: ErrorSettings, folder: Path, workers: int, lpips: str | Path | None, watch: Watch
+) -> list[Path]:
+    """Run all arms of a task, part by part; return the folders of the runs."""
+    recipe, agent = _make_recipes(task, settings)
+    arms = [FLOOR, CEILING, *_order_arms(settings.list_arms(task))]
+    count = -(-settings.episodes // BLOCK)
+    done = []
+    for number in range(1, count + 1):
+        shard = Shard(number, count)
+        log = evaluate(
+            recipe,
+            agent,
+            settings.episodes,
+            arms=arms,
+            out=folder / shard.folder,
+            resume=True,
+            shard=str(shard),
+            workers=workers,
+            seed=settings.seed,
+            keep_images=0,
+            fidelity=True,
+            fidelity_share=settings.fidelity_share,
+            lpips=lpips,
+            progress=False,
+        )
+        log.close()
+        done.append(folder / shard.folder)
+        watch(task, number, count, f"{shard.select(settings.episodes).stop}/{settings.episodes} episodes")
+    return done
+
+
+def _order_arms(arms: Mapping[str, tuple[str, float]]) -> list[str]:
+    """Return the arms with the largest dose of each kind first, so that a study that is cut off has all kinds."""
+    doses: dict[str, list[float]] = {}
+    for kind, dose in arms.values():
+        doses.setdefault(kind, []).append(dose)
+    return sorted(arms, key=lambda arm: -doses[arms[arm][0]].index(arms[arm][1]))
+
+
+def _make_recipes(task: str, settings: ErrorSettings) -> tuple[TaskRecipe, AgentRecipe]:
+    walks = getattr(task_class(task), "space", PRIMITIVES) == PRIMITIVES
+    options: dict[str, Any] = {"seed": settings.seed}
+    if walks:
+        options |= {"per_scene": settings.per_scene}
+        options |= {} if settings.scenes is None else {"scenes": settings.scenes}
+    policy = settings.policy or task_class(task).default_policy
+    return TaskRecipe(task, options), AgentRecipe(policy, "oracle", model_options=_size_option(settings))
+
+
+def _size_option(settings: ErrorSettings) -> dict[str, Any]:
+    return {} if settings.size is None else {"size": list(settings.size)}
+
+
+def _read_task(task: str, settings: ErrorSettings, parts: Sequence[Path]) -> ErrorTable:
+    """Return the numbers of a task from its runs, which may be unfinished."""
+    with ExitStack() as stack:
+        logs = [load_run(path) for path in parts]
+        for log in logs:
+            stack.callback(log.close)
+        return summarise_errors(
+            task,
+            settings.policy or str(task_class(task).default_policy),
+            [row for log in logs for row in log.store.outcomes()],
+            (row for log in logs for row in log.store.decisions()),
+            settings.list_arms(task),
+            settings.list_left_out(task),
+            settings.seed,
+        )

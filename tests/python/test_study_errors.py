@@ -1,0 +1,135 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The study of errors: known costs are found again, runs go on where they stopped, and the page says what came out."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from wiw.analysis.errors import METRES, summarise_errors
+from wiw.cli import main
+from wiw.errors import ArgumentError
+from wiw.experiments.errors import ERRORS
+from wiw.report.error_page import write_errors
+from wiw.report.error_tables import explain
+from wiw.studies.errors import ErrorSettings, read_errors, study_errors
+
+ARMS = {"error-blur@64": ("blur", 64.0), "error-lag@2": ("lag", 2.0), "error-lag@4": ("lag", 4.0)}
+DISTANCE = {"error-blur@64": 0.5, "error-lag@2": 0.2, "error-lag@4": 0.4}
+COST = {"error-blur@64": 0.0, "error-lag@2": 0.25, "error-lag@4": 0.5}
+"""Share of the successes that an arm loses: nothing by blur, in proportion to the distance by lag."""
+EPISODES = 40
+
+
+def outcomes() -> list[dict]:
+    rows = []
+    for arm in ("none", "oracle", *ARMS):
+        for index in range(EPISODES):
+            lost = (index // 10) / 4 < COST.get(arm, 0.0)
+            success = float(arm != "none" and not lost)
+            metrics = {"success": success, "actions": 10.0 + 5 * (arm != "oracle")}
+            rows.append({"arm": arm, "episode": index, "scene": f"s{index % 10}", "status": "done", "metrics": metrics})
+    return rows
+
+
+def decisions() -> list[dict]:
+    rows = []
+    for arm in ("oracle", *ARMS):
+        far = DISTANCE.get(arm, 0.0)
+        poses = {"pose_errors": [[far * ("lag" in arm), 0.0], [None, None]]} if arm != "oracle" else {}
+        measured = {"ssim": [1 - far, None], "psnr": [100 - 50 * far, None], "regret": 2 * COST.get(arm, 0.0), **poses}
+        rows += [{"arm": arm, "episode": index, "fidelity": measured} for index in range(EPISODES)]
+        rows += [{"arm": arm, "episode": 0, "fidelity": None}]
+    return rows
+
+
+@pytest.fixture(scope="module")
+def table():
+    return summarise_errors("imagenav", "matcher", outcomes(), decisions(), ARMS, ["open"])
+
+
+def test_every_arm_is_paired_with_the_oracle(table) -> None:
+    assert (table.label, table.episodes, table.scenes, table.distance) == ("SR", EPISODES, 10, "1 - SSIM")
+    assert table.references["none"].value == 0 and table.references["oracle"].value == 100
+    assert table.gain.estimate.value == 100
+    found = {line.arm: line for line in table.lines}
+    for arm, (kind, dose) in ARMS.items():
+        line = found[arm]
+        assert (line.kind, line.family, line.dose) == (kind, ERRORS[kind].family, dose)
+        assert line.loss.estimate.value == pytest.approx(-100 * COST[arm])
+        assert line.regret.estimate.value == pytest.approx(2 * COST[arm])
+        assert line.actions.estimate.value == 5
+        assert line.measures["1 - SSIM"].value == pytest.approx(DISTANCE[arm])
+    assert found["error-lag@4"].loss.p_adjusted < 0.05 < found["error-blur@64"].loss.p_adjusted
+
+
+def test_costs_are_slopes_through_the_oracle(table) -> None:
+    costs = {(each.family, each.measure): each for each in table.costs}
+    assert costs["looks", "1 - SSIM"].loss.value == 0
+    control = costs["control", "1 - SSIM"]
+    assert control.loss.value == pytest.approx(12.5) and control.arms == 2  # 50 points for 0.4
+    assert control.regret.value == pytest.approx(0.25)
+    assert costs["control", METRES].loss.value == pytest.approx(12.5) and ("looks", METRES) not in costs
+    (gap,) = [each for each in table.gaps if each.measure == "1 - SSIM"]
+    assert (gap.family, gap.base) == ("control", "looks") and gap.loss.value == pytest.approx(12.5)
+    assert gap.loss.excludes_zero
+
+
+def test_the_words_say_what_the_numbers_do(table) -> None:
+    text = " ".join(explain(table))
+    assert "Errors of control cost 12.5" in text and "control costs more" in text
+    assert "Errors of looks cost 0.0" in text and "error-lag@4" in text
+    assert "Left out, for they make no sense in imagenav: open." in text
+
+
+def test_the_page_has_figure_tables_and_units(table, tmp_path: Path) -> None:
+    settings = {"episodes": EPISODES, "seed": 0, "fidelity_share": 0.25}
+    written = write_errors([table], settings, "{}", tmp_path)
+    assert [path.name for path in written] == ["errors.html", "errors.svg", "errors.png", "errors.json"]
+    assert all(path.stat().st_size > 0 for path in written)
+    page = written[0].read_text()
+    assert page.count("<svg") == 1 and "error-lag@4" in page and ERRORS["lag"].unit in page
+
+
+def test_unfinished_arms_are_shown_as_far_as_they_are() -> None:
+    cut = [
+        row for row in outcomes() if row["arm"] != "error-lag@4" and (row["arm"] != "error-lag@2" or row["episode"] < 7)
+    ]
+    found = summarise_errors("imagenav", "matcher", cut, decisions(), ARMS)
+    assert [line.arm for line in found.lines] == ["error-blur@64", "error-lag@2"] and found.episodes == 7
+
+
+@pytest.mark.parametrize("changes", [{"tasks": ("walking",)}, {"kinds": ()}, {"doses": 4}, {"episodes": 0}])
+def test_settings_out_of_range_are_refused(changes: dict) -> None:
+    with pytest.raises(ArgumentError, match="errors: expected"):
+        ErrorSettings(**changes)
+
+
+def test_what_makes_no_sense_is_left_out_by_name() -> None:
+    settings = ErrorSettings()
+    assert settings.list_left_out("manipulation") == ["open"] and settings.list_left_out("imagenav") == []
+    arms = settings.list_arms("imagenav")
+    assert len(arms) == 3 * len(ERRORS) and arms["error-drift@0.05"] == ("drift", 0.05)
+    assert [dose for _, dose in ErrorSettings(doses=2, kinds=("lag",)).list_arms("ar").values()] == [2.0, 4.0]
+
+
+@pytest.mark.nightly
+def test_a_study_goes_on_where_it_stopped(two_rooms: str, tmp_path: Path, capsys) -> None:
+    settings = ErrorSettings(
+        tasks=("imagenav",), kinds=("blur", "ignored"), doses=1, episodes=2, scenes=two_rooms, size=(64, 128)
+    )
+    found = study_errors(tmp_path / "study", settings)
+    (table,) = found.tables
+    assert [line.arm for line in table.lines] == ["error-blur@64", "error-ignored@1"] and table.episodes == 2
+    stores = sorted((tmp_path / "study").rglob("run.sqlite"))
+    again = study_errors(tmp_path / "study", settings)
+    assert again.to_json() == found.to_json() == read_errors(tmp_path / "study", settings).to_json()
+    assert stores == sorted((tmp_path / "study").rglob("run.sqlite"))
+    arguments = ["--out", str(tmp_path / "study"), "--tasks", "imagenav", "--kinds", "blur,ignored", "--doses", "1"]
+    assert main(["study", "errors", *arguments, "--episodes", "2", "--scenes", two_rooms, "--read-only"]) == 0
+    assert "Errors of control cost" in " ".join(capsys.readouterr().out.split())
+    numbers = json.loads((tmp_path / "study" / "errors.json").read_text())
+    assert np.isfinite(numbers["tasks"][0]["lines"][0]["outcome"]["value"])
