@@ -14,6 +14,7 @@ from wiw.analysis.stopping import list_units, parse_stop_rule
 from wiw.cli import main
 from wiw.errors import ArgumentError, StoreError
 from wiw.runs.config import RunConfig
+from wiw.runs.recipes import AgentRecipe, TaskRecipe
 from wiw.studies.evaluate import resume_run, run_arms
 from wiw.studies.run_log import load_run
 from wiw.types import Episode
@@ -189,6 +190,18 @@ def test_an_interrupted_run_goes_on_to_the_same_stop(tmp_path, monkeypatch):
     whole = run_arms(LineTask(), AGENTS, 100, out=tmp_path / "whole", **rule)
     assert resumed.store.info["stopped"] == whole.store.info["stopped"]
     assert str(resumed.numbers()) == str(whole.numbers())
+
+
+@pytest.mark.nightly
+def test_workers_stop_at_the_same_look(tmp_path):
+    rule = {"until": "width(none)<60", "look_every": 8, "progress": False}
+    agents = {"none": AgentRecipe("heuristic")}
+    runs = [
+        run_arms(TaskRecipe("fakes:line_task"), agents, 40, out=tmp_path / str(workers), workers=workers, **rule)
+        for workers in (1, 2)
+    ]
+    assert runs[0].store.info["stopped"] == runs[1].store.info["stopped"]
+    assert str(runs[0].numbers()) == str(runs[1].numbers())
 
 
 def test_settings_that_do_not_go_together():
