@@ -10,7 +10,7 @@ from rich.console import Console
 from rich.text import Text
 
 from wiw.analysis.errors import METRES, PSNR, STEP, Cost, CostGap, ErrorLine, ErrorTable
-from wiw.analysis.statistics import Difference, Estimate
+from wiw.analysis.statistics import LEVEL, Difference, Estimate
 from wiw.analysis.summary import show_estimate, show_p
 from wiw.experiments.errors import ERRORS
 from wiw.report.quality_tables import RANK_TITLES, show_rank
@@ -18,7 +18,7 @@ from wiw.report.tables import ROOMY, print_stacked
 
 ABOUT: Mapping[str, str] = {
     "minus oracle": "Paired difference from the same agent with true futures, in points.",
-    "p": "Exact McNemar test of this difference, adjusted by Holm for all arms.",
+    "p": "Sign-flip test over scenes of this difference, adjusted by Holm for all arms.",
     "regret": "Reviser's score of the best true future less that of the chosen plan's; minus the oracle's.",
     "actions": "Executed actions per episode, minus the oracle's.",
     "1 - SSIM": "Dissimilarity of imagined and true frames, as the reviser sees them.",
@@ -80,7 +80,7 @@ def explain(table: ErrorTable) -> list[str]:
     gain = table.gain
     found = []
     if gain is not None:
-        sure = "" if gain.estimate.excludes_zero else ", which may be chance: little can be lost that was not won"
+        sure = "" if gain.p_value <= LEVEL else ", which may be chance: little can be lost that was not won"
         found.append(f"True futures bring {show_estimate(gain.estimate, signed=True)} points over none{sure}.")
     costs = [each for each in table.costs if each.measure == table.distance]
     found += [_tell_cost(each, table.label) for each in costs]
@@ -154,8 +154,7 @@ def _name_step(measure: str) -> str:
 
 
 def _is_loss(line: ErrorLine) -> bool:
-    p_value = line.loss.p_adjusted
-    return p_value is not None and p_value <= 0.05 and line.loss.estimate.value < 0
+    return line.loss.is_shown and line.loss.estimate.value < 0
 
 
 def _tell_cost(found: Cost, label: str) -> str:
