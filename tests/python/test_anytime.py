@@ -2,6 +2,7 @@
 """Looking early: confidence sequences, rules for stopping, and runs that stop by them."""
 
 import math
+import sqlite3
 
 import numpy as np
 import pytest
@@ -15,7 +16,7 @@ from wiw.cli import main
 from wiw.errors import ArgumentError, StoreError
 from wiw.runs.config import RunConfig
 from wiw.runs.recipes import AgentRecipe, TaskRecipe
-from wiw.studies.evaluate import resume_run, run_arms
+from wiw.studies.evaluate import run_arms
 from wiw.studies.run_log import load_run
 from wiw.types import Episode
 
@@ -130,7 +131,8 @@ AGENTS = {"none": LineAgent(0.2), "oracle": LineAgent(1.0)}
 
 def test_a_run_stops_as_soon_as_it_has_shown_enough(tmp_path, capsys):
     run = tmp_path / "run"
-    log = run_arms(LineTask(), AGENTS, 200, out=run, until="oracle-none excludes 0", look_every=16)
+    given = {"out": run, "until": "oracle-none excludes 0", "look_every": 16}
+    log = run_arms(LineTask(), AGENTS, 200, **given)
     stopped = log.store.info["stopped"]
     assert log.complete and 16 <= stopped["episodes"] < 80 and stopped["episodes"] % 16 == 0
     assert {row["episode"] for row in log.episodes} == set(range(stopped["episodes"]))
@@ -148,8 +150,7 @@ def test_a_run_stops_as_soon_as_it_has_shown_enough(tmp_path, capsys):
             in text
         )
         assert "a betting test over scenes" in text
-    again = resume_run(run, progress=False) if log.store.info["task"] else log
-    assert again.store.info["stopped"] == stopped
+    assert run_arms(LineTask(), AGENTS, 200, resume=True, **given).store.info["stopped"] == stopped
     with pytest.raises(StoreError, match="until"):
         run_arms(LineTask(), AGENTS, 200, out=run, resume=True, until="width<5", progress=False)
 
@@ -221,3 +222,9 @@ def test_command_line(tmp_path, capsys):
     assert main([*run, "--until", "twin-none excludes 0"]) == 0
     assert "until   twin-none excludes 0; a look every 4 episodes per arm" in capsys.readouterr().err
     assert wiw.load_run(tmp_path / "run").store.info["until"] == {"rule": "twin-none excludes 0", "every": 4}
+    with sqlite3.connect(tmp_path / "run" / "run.sqlite") as store:
+        store.execute("DELETE FROM outcome WHERE arm = 'twin' AND episode > 5")
+    assert main(["resume", str(tmp_path / "run"), "--no-report"]) == 0
+    said = capsys.readouterr().err
+    assert "4 of 8 episodes: twin-none" in said and "8 of 8 episodes: twin-none" in said
+    assert wiw.load_run(tmp_path / "run").complete
