@@ -18,7 +18,7 @@ from wiw.report.tables import ROOMY, print_stacked
 
 ABOUT: Mapping[str, str] = {
     "minus oracle": "Paired difference from the same agent with true futures, in points.",
-    "p": "Exact McNemar test of this difference, adjusted by Holm for all arms.",
+    "p": "Of this difference, by a test over scenes (docs/statistics.md), adjusted by Holm for all arms.",
     "regret": "Reviser's score of the best true future less that of the chosen plan's; minus the oracle's.",
     "actions": "Executed actions per episode, minus the oracle's.",
     "1 - SSIM": "Dissimilarity of imagined and true frames, as the reviser sees them.",
@@ -154,8 +154,7 @@ def _name_step(measure: str) -> str:
 
 
 def _is_loss(line: ErrorLine) -> bool:
-    p_value = line.loss.p_adjusted
-    return p_value is not None and p_value <= 0.05 and line.loss.estimate.value < 0
+    return line.loss.is_shown and line.loss.estimate.value < 0
 
 
 def _tell_cost(found: Cost, label: str) -> str:
