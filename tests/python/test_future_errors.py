@@ -14,7 +14,7 @@ import wiw
 from wiw.action import FORWARD, TURN_LEFT
 from wiw.cli import main
 from wiw.datasets.questions.facts import STRUCTURE
-from wiw.errors import ArgumentError
+from wiw.errors import ArgumentError, RolloutError
 from wiw.experiments.errors import ERRORS, make_error
 from wiw.experiments.errors.content import list_barriers, list_things
 from wiw.experiments.errors.control import MotionDegradation, list_moves
@@ -23,6 +23,7 @@ from wiw.experiments.errors.erroneous import Erroneous
 from wiw.experiments.errors.forks import Walker, WorldFork
 from wiw.experiments.errors.looks import FrameDegradation
 from wiw.experiments.fidelity import FidelityObserver
+from wiw.loop.attempts import Attempted
 from wiw.loop.clock import Clock
 from wiw.loop.config import AgentConfig
 from wiw.loop.imagination import ModelInput, Request
@@ -222,6 +223,21 @@ def bench():
     env = task.environment()
     env.begin(task.episode(0))
     return env.fork()
+
+
+def test_frames_of_a_changed_world_need_not_look_like_the_observation(env) -> None:
+    """Where things are moved, red and blue may seem exchanged; that is no broken contract."""
+
+    class Strange(Oracle):
+        def rollout(self, observations, controls, seeds):
+            frames = super().rollout(observations, controls, seeds)
+            frames[:, 1:] = frames[:, 1:, ..., ::-1]
+            return frames
+
+    model = Attempted(Strange(SIZE))
+    with pytest.raises(RolloutError):
+        imagine(env, "moved@0", model=model)
+    assert len(imagine(env, "moved@1", model=model).rollouts[0][0].frames) == 4
 
 
 def test_things_on_a_table_are_drawn_elsewhere_while_physics_stays_true(bench) -> None:

@@ -94,12 +94,17 @@ def test_the_page_has_figure_tables_and_units(table, tmp_path: Path) -> None:
     assert page.count("<svg") == 1 and "error-lag@4" in page and ERRORS["lag"].unit in page
 
 
-def test_unfinished_arms_are_shown_as_far_as_they_are() -> None:
-    cut = [
-        row for row in outcomes() if row["arm"] != "error-lag@4" and (row["arm"] != "error-lag@2" or row["episode"] < 7)
-    ]
+def test_unfinished_arms_are_shown_but_not_counted_among_the_costs() -> None:
+    missing = {"error-lag@4": 0, "error-lag@2": 7}
+    cut = [row for row in outcomes() if row["episode"] < missing.get(row["arm"], EPISODES)]
     found = summarise_errors("imagenav", "matcher", cut, decisions(), ARMS)
-    assert [line.arm for line in found.lines] == ["error-blur@64", "error-lag@2"] and found.episodes == 7
+    assert [line.arm for line in found.lines] == ["error-blur@64", "error-lag@2"]
+    assert found.episodes == EPISODES and {cost.family for cost in found.costs} == {"looks"}
+
+
+def test_an_error_that_costs_nothing_so_far_is_not_sure_to_cost_nothing(table) -> None:
+    (looks,) = [cost for cost in table.costs if cost.family == "looks" and cost.measure == "1 - SSIM"]
+    assert looks.loss.low < 0 < looks.loss.high < 5
 
 
 @pytest.mark.parametrize("changes", [{"tasks": ("walking",)}, {"kinds": ()}, {"doses": 4}, {"episodes": 0}])

@@ -17,7 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from wiw.analysis.rank_correlation import Correlation, correlate
-from wiw.analysis.statistics import Difference, Estimate, adjust_p_values, compare, estimate_mean
+from wiw.analysis.statistics import Difference, Estimate, adjust_p_values, compare, estimate_difference, estimate_mean
 from wiw.analysis.summary import split_outcomes
 from wiw.experiments.errors import ERRORS
 from wiw.metrics.metric import ANSWER_SCORE, MEAN_TRAJECTORY, SUCCESS, Metric
@@ -30,6 +30,8 @@ PSNR, METRES, DEGREES = "PSNR", "metres", "degrees"
 MEASURES = (*DISTANCES, PSNR, METRES, DEGREES)
 STEP = 0.1
 """Distance that costs are given for."""
+MOST_MISSING = 0.1
+"""Share of the oracle's episodes that an arm may lack to count among the costs of its family."""
 FLOOR, CEILING = "none", "oracle"
 
 
@@ -86,7 +88,7 @@ class ErrorTable:
     label: str
     """Of the outcome: "SR" or "Score"."""
     episodes: int
-    """Scored in every arm."""
+    """Scored in none, the oracle and every arm that counts among the costs."""
     scenes: int
     references: Mapping[str, Estimate]
     """Outcome of "none" and "oracle"."""
@@ -132,15 +134,16 @@ def summarise_errors(
     measured = _average_by_episode(decisions)
     _add_regret(done, measured)
     shown = [arm for arm in arms if done[arm] and done[CEILING]]
-    scored = set.intersection(*(set(done[arm]) for arm in (FLOOR, CEILING, *shown)))
+    pooled_arms = _choose_pooled(shown, done)
+    scored = set.intersection(*(set(done[arm]) for arm in (FLOOR, CEILING, *pooled_arms)))
     metric = next(
         metric
         for metric in (SUCCESS, ANSWER_SCORE)
         if all(metric.name in row["metrics"] for own in done.values() for row in own.values())
     )
     lines = _adjust([_line(arm, *arms[arm], done, measured, metric, seed) for arm in shown])
-    pooled = _Pooled(shown, sorted(scored), done, measured, metric, seed)
-    costs, gaps = _list_costs(lines, pooled)
+    pooled = _Pooled(pooled_arms, sorted(scored), done, measured, metric, seed)
+    costs, gaps = _list_costs([line for line in lines if line.arm in pooled_arms], pooled)
     return ErrorTable(
         task,
         policy,
@@ -159,6 +162,12 @@ def summarise_errors(
 
 Done = Mapping[str, Mapping[int, Mapping[str, Any]]]
 Measured = Mapping[str, Mapping[int, Mapping[str, float]]]
+
+
+def _choose_pooled(arms: Sequence[str], done: Done) -> list[str]:
+    """Return the arms that lack at most `MOST_MISSING` of the oracle's episodes; all where none is so far yet."""
+    whole = len(done[CEILING])
+    return [arm for arm in arms if len(done[arm]) >= (1 - MOST_MISSING) * whole] or list(arms)
 
 
 def _average_by_episode(decisions: Iterable[Mapping[str, Any]]) -> dict[str, dict[int, dict[str, float]]]:
@@ -244,7 +253,7 @@ class _Pooled:
     def __init__(
         self, arms: Sequence[str], episodes: Sequence[int], done: Done, measured: Measured, metric: Metric, seed: int
     ) -> None:
-        self._arms, self._seed, self._scale = list(arms), seed, metric.scale
+        self._arms, self._seed, self._metric = list(arms), seed, metric
         self._scenes = [done[CEILING][index]["scene"] for index in episodes]
         self._outcome = self._read(arms, episodes, lambda arm, index: done[arm][index]["metrics"][metric.name])
         self._lost = (
@@ -280,20 +289,27 @@ class _Pooled:
         return weights
 
     def estimate_loss(self, weights: NDArray[np.float64]) -> Estimate | None:
-        """Return the weighted sum of what the arms lose, in points; None without episodes."""
-        return self._estimate_mean(self._scale * (weights @ self._lost))
+        """Return the weighted sum of what the arms lose, in points; None without episodes.
+
+        As a share of the most that could be lost or won it is a difference of rates, whose interval is honest where few
+        episodes differ.
+        """
+        most = float(np.abs(weights).sum())
+        if not self._scenes:
+            return None
+        shares = weights @ self._lost / most
+        found = estimate_difference(shares, np.zeros_like(shares), self._scenes, self._metric, seed=self._seed)
+        return replace(found, value=most * found.value, low=most * found.low, high=most * found.high, bootstrap=None)
 
     def estimate_regret(self, weights: NDArray[np.float64]) -> Estimate | None:
         """Return the weighted sum of what the arms gain in regret, over episodes in which it was measured in all."""
         used = weights != 0
-        return self._estimate_mean(weights[used] @ self._regret[used])
-
-    def _estimate_mean(self, values: NDArray[np.float64]) -> Estimate | None:
+        values = weights[used] @ self._regret[used]
         known = np.isfinite(values)
         if not known.any():
             return None
         scenes = [scene for scene, each in zip(self._scenes, known, strict=True) if each]
-        return estimate_mean(values[known], scenes, Metric("cost", "cost", "length", False), seed=self._seed)
+        return estimate_difference(values[known], np.zeros(int(known.sum())), scenes, REGRET, seed=self._seed)
 
     def correlate_measures(self) -> tuple[Correlation, ...]:
         """Return how well each measure orders the arms by the outcome."""

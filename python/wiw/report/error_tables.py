@@ -95,8 +95,8 @@ def explain(table: ErrorTable) -> list[str]:
     if table.left_out:
         found.append(f"Left out, for they make no sense in {table.task}: {', '.join(table.left_out)}.")
     found.append(
-        f"{table.episodes} episodes in {table.scenes} scenes, policy {table.policy}; costs are over the episodes that "
-        "are scored in all arms. Intervals: 95 %, over scenes. A cost assumes losses in proportion to distance."
+        f"{table.episodes} episodes in {table.scenes} scenes, policy {table.policy}; costs are over episodes that are "
+        "scored in all of their arms. Intervals: 95 %, over scenes. A cost assumes losses in proportion to distance."
     )
     return found
 

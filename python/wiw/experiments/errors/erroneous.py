@@ -51,7 +51,9 @@ class ErroneousModel(ModelWrapper):
         """Return the model's frames with the error."""
         if not self.error.dose:
             return self.model.rollout(observations, controls, seeds)
-        return self.error.rollout(self.model, observations, controls, seeds)
+        # The oracle's frames of a changed world or way need not look like the observation, so they are not held to it.
+        model = self.model.unwrapped if self.error.needs_simulator else self.model
+        return self.error.rollout(model, observations, controls, seeds)
 
 
 class Erroneous(ModelImaginer):

@@ -69,7 +69,7 @@ class Blur(FrameDegradation):
         """Return the frame blurred; a panorama across its seam."""
         sigma = self.dose * frame.shape[1] / WIDTH
         margin = min(frame.shape[1], int(np.ceil(3 * sigma))) if panorama else 0
-        padded = cv2.copyMakeBorder(frame, 0, 0, margin, margin, cv2.BORDER_WRAP) if margin else frame
+        padded = np.asarray(cv2.copyMakeBorder(frame, 0, 0, margin, margin, cv2.BORDER_WRAP), np.uint8)
         small = _shrink(padded, max(1.0, sigma / FINE))  # a wide Gaussian takes seconds, and leaves no fine detail
         soft = cv2.GaussianBlur(small, (0, 0), min(sigma, FINE), borderType=cv2.BORDER_REFLECT_101)
         found = cv2.resize(soft, (padded.shape[1], padded.shape[0]), interpolation=cv2.INTER_LINEAR)
