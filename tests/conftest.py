@@ -15,6 +15,7 @@ import hypothesis
 import pytest
 
 import wiw
+from boxes import write_boxes
 
 ROOT = Path(__file__).parents[1]
 
@@ -168,19 +169,5 @@ def world_model_options(
 def two_rooms(tmp_path_factory: pytest.TempPathFactory) -> str:
     """Path of an OBJ with two furnished rooms of 4 x 4 m, joined by a door: a scene spec that loads in milliseconds."""
     folder = tmp_path_factory.mktemp("scene")
-    materials = "".join(f"newmtl {name}\nKd {r} {g} {b}\n" for name, (r, g, b) in COLORS.items())
-    (folder / "two_rooms.mtl").write_text(materials)
-    lines, base = ["mtllib two_rooms.mtl"], 1
-    for name, (material, low, high) in BOXES.items():
-        lines += [f"o {name}", f"usemtl {material}"]
-        lines += [
-            f"v {(low, high)[x][0]} {(low, high)[y][1]} {(low, high)[z][2]}"
-            for x in (0, 1)
-            for y in (0, 1)
-            for z in (0, 1)
-        ]
-        quads = ((0, 1, 3, 2), (4, 6, 7, 5), (0, 4, 5, 1), (2, 3, 7, 6), (0, 2, 6, 4), (1, 5, 7, 3))
-        lines += ["f " + " ".join(str(base + i) for i in quad) for quad in quads]
-        base += 8
-    (folder / "two_rooms.obj").write_text("\n".join(lines))
+    write_boxes(folder / "two_rooms.obj", BOXES, COLORS)
     return str(folder / "two_rooms.obj")

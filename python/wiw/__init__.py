@@ -58,6 +58,7 @@ __all__ = [
     "scenes",
     "show",
     "status",
+    "study",
     "study_errors",
     "types",
     "verify",
@@ -91,6 +92,7 @@ _HOME = {
     "quality": "wiw.studies.quality",
     "scale": "wiw.studies.scale",
     "show": "wiw.viz.show",
+    "study": "wiw.studies.study",
     "status": "wiw.runs.status",
     "study_errors": "wiw.studies.errors",
     "verify": "wiw.runs.verify",
@@ -159,6 +161,7 @@ if TYPE_CHECKING:
     from wiw.studies.quality import quality
     from wiw.studies.run_log import load_run
     from wiw.studies.scale import scale
+    from wiw.studies.study import study
     from wiw.tasks.base import Task
     from wiw.training.collect import collect
     from wiw.training.collect_navigation import collect_navigation

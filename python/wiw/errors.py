@@ -10,6 +10,7 @@ __all__ = [
     "ContractError",
     "DependencyError",
     "DeviceMemoryError",
+    "EpisodesError",
     "Error",
     "FileError",
     "InfrastructureError",
@@ -39,6 +40,17 @@ def is_stop_request(error: BaseException) -> bool:
     """
     own = type(error).__module__.partition(".")[0] == "wiw" and not isinstance(error, Exception)
     return own or isinstance(error, KeyboardInterrupt)
+
+
+class EpisodesError(ArgumentError):
+    """A scene has no episode that satisfies the rules asked for; `rule` is the one that the best attempts broke."""
+
+    def __init__(self, message: str, rule: str) -> None:
+        super().__init__(message)
+        self.rule = rule
+
+    def __reduce__(self) -> tuple[type, tuple[str, str]]:
+        return type(self), (str(self), self.rule)
 
 
 class RegistryError(Error, LookupError):

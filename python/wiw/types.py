@@ -451,7 +451,7 @@ class Episode:
     """Shortest path from start to goal in metres; NaN where an episode file does not give it."""
     info: Mapping[str, Any] = field(default_factory=dict)
     """ImageNav reads "ideal_primitives", the least number of primitives, "radius", the goal's own in metres, and
-    "goal_image", the file of a panorama at the goal.
+    "goal_image", the file of a panorama at the goal; "tier" is the tier that it was generated for.
     AR reads "target", an instance's id, and "category", what it is. Manipulation reads "task", "seed" and
     "variation", and tells reports the "instruction"."""
 
@@ -459,6 +459,16 @@ class Episode:
     def kind(self) -> str:
         """Which of several tasks in one it is of; empty where there is one."""
         return str(self.info.get("task", ""))
+
+    @property
+    def tier(self) -> str:
+        """The tier that it was generated for; empty for none."""
+        return str(self.info.get("tier", ""))
+
+    @property
+    def group(self) -> str:
+        """Its kind or tier, which reports show apart; empty for neither."""
+        return self.kind or self.tier
 
 
 @dataclass(frozen=True)

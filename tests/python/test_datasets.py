@@ -13,8 +13,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from wiw.datasets import episodes as files
+from wiw.datasets.cameras import camera_pose
 from wiw.datasets.habitat import heading_of, yaw_of
-from wiw.datasets.imagenav import camera_pose
 from wiw.datasets.worlds import world
 from wiw.errors import FileError
 from wiw.runs.recipes import AgentRecipe, TaskRecipe

@@ -13,7 +13,8 @@ import wiw.datasets.imagenav
 import wiw.tasks.navigation
 from wiw.action import FORWARD, STOP, TURN_LEFT, TURN_RIGHT
 from wiw.datasets import episodes as episode_files
-from wiw.datasets.imagenav import camera_pose, ideal_primitives
+from wiw.datasets.cameras import camera_pose
+from wiw.datasets.imagenav import ideal_primitives
 from wiw.errors import ArgumentError
 from wiw.tasks.imagenav import ImageNav
 from wiw.types import Episode

@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from wiw.datasets.imagenav import camera_pose
+from wiw.datasets.cameras import camera_pose
 from wiw.datasets.worlds import World, world
 from wiw.errors import ArgumentError, ContractError, WeightsError
 from wiw.perception.detection import Detections, Detector

@@ -15,7 +15,7 @@ from hypothesis import strategies as st
 
 from wiw._core import env as core_env
 from wiw.action import FORWARD, NULL, TURN_LEFT, TURN_RIGHT
-from wiw.datasets.imagenav import camera_pose
+from wiw.datasets.cameras import camera_pose
 from wiw.errors import ArgumentError
 from wiw.nav import Ground, NavMesh
 from wiw.render import Renderer

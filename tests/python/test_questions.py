@@ -16,7 +16,7 @@ from hypothesis import strategies as st
 
 from wiw import scenes
 from wiw.datasets import episodes as episode_file
-from wiw.datasets.imagenav import camera_pose
+from wiw.datasets.cameras import camera_pose
 from wiw.datasets.questions import Question, balance, blind, generate, grammar, parse, phrase, twins
 from wiw.datasets.questions.answers import LOOKED_FOR, Fact, differ, find_answer, propose
 from wiw.datasets.questions.colors import name_colors

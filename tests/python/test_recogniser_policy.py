@@ -17,7 +17,7 @@ from test_active_recognition import Sink
 import wiw
 from recognition_file import CHOICES, a_file
 from wiw.action import FORWARD, TURN_LEFT, TURN_RIGHT
-from wiw.datasets.imagenav import camera_pose
+from wiw.datasets.cameras import camera_pose
 from wiw.datasets.visibility import visible_fraction
 from wiw.datasets.worlds import world
 from wiw.loop.scheduler import run_episodes

@@ -12,7 +12,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from wiw.action import FORWARD, TURN_LEFT, TURN_RIGHT, to_viewpoints
-from wiw.datasets.imagenav import camera_pose
+from wiw.datasets.cameras import camera_pose
 from wiw.datasets.worlds import world
 from wiw.envs.pointing import Pointing
 from wiw.errors import ArgumentError, WeightsError

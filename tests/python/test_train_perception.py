@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 
 from wiw.cli.app import main
-from wiw.datasets.imagenav import camera_pose
+from wiw.datasets.cameras import camera_pose
 from wiw.datasets.worlds import world
 from wiw.errors import ArgumentError
 from wiw.perception.colors import COLORS, ColorNamer

@@ -83,6 +83,36 @@ def test_navigation_asks_for_plans_then_for_one_that_knows_the_futures(two_rooms
     assert decision.spent["vlm_calls"] == 4 and decision.spent["vlm_tokens"] > 1000
 
 
+def test_imagined_frames_may_be_images_of_their_own_and_without_captions(two_rooms: str) -> None:
+    shapes = {}
+    for shown, captions in (("strip", True), ("strip", False), ("frames", True), ("frames", False)):
+        client = MockClient(script)
+        policy = VLM(client, tracker=None, shown=shown, captions=captions)
+        decide_in(imagenav(two_rooms), policy, "copy", candidates=1)
+        shapes[shown, captions] = [image.shape[:2] for image in images(client.calls[-1])[1:]]
+    side, bar = prompt_images.VIEW, shapes["frames", True][0][0] - prompt_images.VIEW
+    assert shapes["strip", False] == [(side, 3 * side)] and shapes["frames", False] == [(side, side)] * 3
+    assert bar > 10 and shapes["frames", True] == [(side + bar, side)] * 3 and shapes["strip", True][0][0] > side
+    assert VLM(MockClient()).describe().keys() & {"shown", "captions", "roles"} == set()
+    assert policy.describe()["shown"] == "frames" and policy.describe()["captions"] is False
+    with pytest.raises(ArgumentError, match="expected shown strip or frames"):
+        VLM(MockClient(), shown="film")
+    with pytest.raises(ArgumentError, match=r"only for tasks ar, imagenav, got .* captions=False"):
+        wiw.policy("vlm", vlm="mock", space="pose7", captions=False)
+
+
+def test_roles_may_have_models_of_their_own(two_rooms: str) -> None:
+    base, reviser = MockClient(script, model="a"), MockClient(script, model="b")
+    policy = VLM(base, model="a", tracker=None, roles={"revise": {"vlm": reviser, "model": "b"}})
+    decision = decide_in(imagenav(two_rooms), policy, "copy")
+    assert len(base.calls) == 3 and len(reviser.calls) == 1
+    assert [exchange.model for exchange in decision.exchanges] == ["a", "a", "a", "b"]
+    assert decision.spent["vlm_calls"] == 4 and policy.describe()["roles"]["revise"]["model"] == "b"
+    for roles, model in (({"revise": {"model": "b"}}, None), ({"judge": {"model": "b"}}, "a"), ({"revise": {}}, "a")):
+        with pytest.raises(ArgumentError, match="expected roles among propose, revise, answer"):
+            VLM(MockClient(), model=model, roles=roles)
+
+
 def test_without_a_world_model_one_plan_is_asked_for(two_rooms: str) -> None:
     client = MockClient(script)
     decision = decide_in(imagenav(two_rooms), VLM(client))
@@ -279,25 +309,29 @@ def test_strips_name_actions_and_show_where_the_target_is() -> None:
     masks = np.zeros((2, 576, 1024), bool)
     masks[0, 250:300, 500:540] = True
     rollout = Rollout(frames, np.zeros(2, bool), "panorama")
-    strip = prompt_images.render_plan_strip(
-        Proposal([FORWARD, LEFT]), rollout, Track(masks, ((500, 250, 540, 300), None))
-    )
+
+    def draw_plan(*track: Track) -> Any:
+        frames, titles = prompt_images.render_plan_frames(Proposal([FORWARD, LEFT]), rollout, *track)
+        return prompt_images.arrange_frames(frames, titles, strip=True)[0]
+
+    strip = draw_plan(Track(masks, ((500, 250, 540, 300), None)))
     half = strip.shape[1] // 2
     assert redness(strip[:, :half]) > 50 and redness(strip[:, half:]) == 0
-    lost = prompt_images.render_plan_strip(Proposal([FORWARD, LEFT]), rollout)
+    lost = draw_plan()
     bar = strip.shape[0] - prompt_images.VIEW
     assert not np.array_equal(strip[:bar, half:], lost[:bar, half:]), "a bar says that the target is lost"
     np.testing.assert_array_equal(strip[:bar, : half - 4], lost[:bar, : half - 4])
     assert bar > 10 and not np.array_equal(strip[:bar, : prompt_images.VIEW], strip[:bar, -prompt_images.VIEW :])
-    views = prompt_images.render_target_strip(rollout, Track(masks, ((500, 250, 540, 300), None)))
-    assert views is not None and views.shape[1] == prompt_images.VIEW and redness(views) > 50
-    assert (
-        prompt_images.render_target_strip(Rollout(frames, np.ones(2, bool), "panorama"), Track(masks, (None, None)))
-        is None
-    )
+    views, titles = prompt_images.render_target_frames(rollout, Track(masks, ((500, 250, 540, 300), None)))
+    assert views.shape[:3] == (1, prompt_images.VIEW, prompt_images.VIEW) and redness(views[0]) > 50
+    assert titles == ["Imagined view 1"]
+    real = Rollout(frames, np.ones(2, bool), "panorama")
+    assert not len(prompt_images.render_target_frames(real, Track(masks, (None, None)))[0])
     front = Rollout(frames[:, :384, :384], np.zeros(2, bool), "front")
-    boxed = prompt_images.render_target_strip(front, Track(masks[:, :384, :384], ((9, 9, 50, 50), None)))
-    assert boxed is not None and redness(boxed) > 50
+    boxed, _ = prompt_images.render_target_frames(front, Track(masks[:, :384, :384], ((9, 9, 50, 50), None)))
+    assert redness(boxed[0]) > 50
+    bare = prompt_images.arrange_frames(views, None, strip=False)
+    assert len(bare) == 1 and np.array_equal(bare[0], views[0])  # no caption, no bar
 
 
 def test_shipped_prompts_have_the_papers_slots() -> None:

@@ -17,7 +17,7 @@ from hypothesis import strategies as st
 
 import wiw
 from wiw.action import FORWARD, TURN_LEFT, TURN_RIGHT, to_trajectory
-from wiw.datasets.imagenav import camera_pose
+from wiw.datasets.cameras import camera_pose
 from wiw.datasets.worlds import world
 from wiw.errors import DependencyError, WeightsError
 from wiw.reproject import pose

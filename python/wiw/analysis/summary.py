@@ -136,6 +136,8 @@ class Summary:
     """Each arm that repeats another, minus that one."""
     departures: tuple[Departure, ...] = field(default=(), kw_only=True)
     """Where the run departs from the paper's protocol."""
+    tiers: Mapping[str, Summary] = field(default_factory=dict, kw_only=True)
+    """The same numbers of each tier of episodes by itself, where the run has several."""
 
     @property
     def protocol(self) -> str:
@@ -266,10 +268,10 @@ def summarise_run(run: Run) -> Summary:
     """Return means, intervals and paired differences of a run."""
     config = run.store.config
     policies = [arm["name"] for arm in config["arms"] if arm["agent"].get("model") is None]
-    episodes = run.store.episodes()
+    episodes, outcomes = run.store.episodes(), run.store.outcomes()
     found = summarise(
         run.arms,
-        run.store.outcomes(),
+        outcomes,
         len(run.store.own_episodes()) if "stopped" in run.store.info else len(episodes),
         config["seed"],
         policies,
@@ -278,14 +280,15 @@ def summarise_run(run: Run) -> Summary:
         judge=run.store.judge,
         anytime="until" in run.store.info,
     )
-    departures = read_departures(run.store.info)
+    tiers = _summarise_tiers(run, outcomes, policies)
     return replace(
         found,
         unbalanced=count_unbalanced(run),
         trackers=_list_trackers(run),
-        departures=departures,
+        departures=read_departures(run.store.info),
         looks=_describe_looks(run.store.info),
         noise=measure_noise(run),
+        tiers=tiers,
     )
 
 
@@ -331,6 +334,26 @@ def _describe_looks(info: Mapping[str, Any]) -> str:
     )
 
 
+def _summarise_tiers(run: Run, outcomes: Sequence[Mapping[str, Any]], policies: Collection[str]) -> dict[str, Summary]:
+    """Return the numbers of each tier of episodes; nothing where there is one tier, or none."""
+    episodes = run.store.episodes()
+    own = run.store.own_episodes() if "stopped" in run.store.info else range(len(episodes))
+    tiers = dict.fromkeys(episodes[index].tier for index in own)
+    indices = {tier: {index for index in own if episodes[index].tier == tier} for tier in tiers}
+    return {
+        tier: summarise(
+            run.arms,
+            [outcome for outcome in outcomes if outcome["episode"] in indices[tier]],
+            len(indices[tier]),
+            run.store.config["seed"],
+            policies,
+            tables=run.tables,
+            anytime="until" in run.store.info,
+        )
+        for tier in (tiers if len(tiers) > 1 else ())
+    }
+
+
 def _list_trackers(run: Run) -> dict[str, str]:
     """Return the trackers of the arms that imagine, and what each follows."""
     built = run.store.info.get("built", {})
@@ -349,7 +372,17 @@ def arm_table(run: Run) -> Records:
 
     "utility" and its ends are there for arms between floor and ceiling, nan where undefined.
     """
-    summary = summarise_run(run)
+    return Records(_list_lines(summarise_run(run)))
+
+
+def tier_table(run: Run) -> Records:
+    """Return the same of each tier of episodes by itself, with its name as "tier"; empty without several."""
+    tiers = summarise_run(run).tiers
+    return Records({"tier": tier, **line} for tier, own in tiers.items() for line in _list_lines(own))
+
+
+def _list_lines(summary: Summary) -> list[dict[str, Any]]:
+    """Return the lines of a summary as plain values."""
     utilities = {found.arm: found for found in summary.utilities}
     lines = []
     for arm in summary.lines:
@@ -365,7 +398,7 @@ def arm_table(run: Run) -> Records:
                 "approximate_marks": summary.marks.approximate.get(arm.name, 0),
             }
         lines.append(line)
-    return Records(lines)
+    return lines
 
 
 def split_outcomes(

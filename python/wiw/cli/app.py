@@ -37,7 +37,8 @@ from wiw.cli.serve import serve
 from wiw.cli.serve_vlm import serve_vlm
 from wiw.cli.status import status
 from wiw.cli.stop import EXIT_RESUME, Terminated, end_process, raise_on_stop_signals
-from wiw.cli.study import study_data_scaling, study_errors
+from wiw.cli.study import STUDIES
+from wiw.cli.study_file import run_study
 from wiw.cli.submit import cancel, submit
 from wiw.cli.terminal import printable
 from wiw.cli.train import train
@@ -105,6 +106,8 @@ class Group:
     """The second word where none is given."""
     default_takes_words: bool = False
     """Whether that is also where the second word is no command, but a word of the default command."""
+    needs_words: bool = False
+    """Whether the default command cannot be run without words, so that none at all asks for help."""
 
 
 GROUPS: Mapping[str, Group] = {
@@ -162,18 +165,45 @@ GROUPS: Mapping[str, Group] = {
         ((import_prompts, "import", "Write a folder of prompts from LaTeX source or published code."),),
     ),
     "study": Group(
-        "Answer a question by many small trainings, or by many runs.",
-        """Answer a question by many small trainings, or by many runs. Repeat an interrupted command to resume it.
+        "Run many arms, or train many small models, to answer a question: a page with figures and tables.",
+        """Answer a question by many runs or trainings, with figures and tables on one page. Repeat an interrupted
+command to resume it. `wiw list studies` names the shipped ones, and a YAML file is a study of your own:
 
+  $ wiw study front-vs-panorama --small
+  $ wiw study vlm --set server=http://localhost:8000/v1 --set model=qwen2.5-vl-72b-awq
+  $ wiw study models --set arms=none,copy,warp,mine=my_model.py:MyModel,oracle
   $ wiw study errors --small --workers 2
   $ wiw study data-scaling --small --workers 2
-  $ wiw study data-scaling --data data --workers 4
+  $ wiw study my.yaml --set episodes=100
 
-`wiw study WHAT --help` explains each with examples.""",
+my.yaml, in full:
+
+  title: Does a longer horizon help?
+  about: one line for the list of studies
+  variables: {model: warp, episodes: 60}       # --set model=oracle
+  small: {episodes: 4}                         # --small
+  runs:
+    far:                                       # a run: arms on the same episodes of one task
+      task: imagenav
+      task_options: {scenes: "apartments:val:12", tier: far}
+      settings: {episodes: "{episodes}"}       # as of `wiw run`: seed, keep_images, fidelity, ...
+      agent: {policy: matcher, model: "{model}"}   # what the arms share
+      arms:                                    # or text as for `wiw run --arms`
+        none: {model: none}
+        short: {horizon: 5}
+        long: {horizon: 10}
+      compare: [[long, short]]                 # paired differences, besides those from none and copy
+      plots: [success, rollouts]               # and quality, with options of `wiw quality` under `quality:`
+
+Arms take policy, model, reviser, model_options, policy_options, tracker, candidates, horizon, depth, placebo and so
+on, as `wiw.runs.recipes.AgentRecipe` has them. `wiw study WHAT --help` explains each command.""",
         (
-            (study_data_scaling, "data-scaling", "Does a world model get better with data, or with updates?"),
-            (study_errors, "errors", "What kind of error of imagined futures costs success?"),
+            (run_study, "run", "A study by name or from a YAML file; `wiw study NAME` is short for it."),
+            *STUDIES,
         ),
+        default="run",
+        default_takes_words=True,
+        needs_words=True,
     ),
 }
 
@@ -244,7 +274,7 @@ def _dispatch(arguments: Sequence[str]) -> Any:
 def _dispatch_group(name: str, arguments: Sequence[str]) -> Any:
     group = GROUPS[name]
     known = [each for _, each, _ in group.commands]
-    given = list(arguments) or ([] if group.default_takes_words else ["--help"])
+    given = list(arguments) or ([] if group.default_takes_words and not group.needs_words else ["--help"])
     first = next(iter(given), "")
     is_own = group.default_takes_words or first.startswith("-")
     if group.default and is_own and first not in (*known, "-h", "--help"):

@@ -19,10 +19,12 @@ def episodes(
     scenes: Annotated[str | None, arg(metavar="SPEC")] = None,
     episodes: Annotated[int, arg(metavar="N")] = 20,
     per_scene: Annotated[int | None, arg(metavar="N")] = None,
+    tier: Literal["near", "far", "beyond", "all"] | None = None,
     seed: Annotated[int, arg(metavar="N")] = 0,
     backend: Literal["auto", "cpu", "gpu"] | None = None,
     attributes: Annotated[Path | None, arg(metavar="FILE")] = None,
     task_option: Options = (),
+    sheet: Annotated[Path | None, arg(metavar="PNG")] = None,
     overwrite: bool = False,
 ) -> int:
     """Generate the episodes of a task and write them to a file, which `wiw run --episode-file` takes.
@@ -31,6 +33,7 @@ def episodes(
     $ wiw episodes imagenav --scenes house.glb --per-scene 10 --episodes 10 --out house.json
     $ wiw run imagenav --episode-file house.json --world-model warp
     $ wiw episodes aeqa --scenes house.world --attributes house.json --episodes 40 --out house_questions.json
+    $ wiw episodes imagenav --tier beyond --scenes apartments:test:12 --episodes 60 --out beyond.json.gz
     $ wiw episodes ar --task-option categories=bed,sofa,desk --out three.json
 
     Scenes inside the file's folder are named by relative paths, so that the folder can be moved or shared.
@@ -42,12 +45,16 @@ def episodes(
             apartments:val if not given.
         episodes: Number of episodes.
         per_scene: Episodes per scene; the task's own number if not given.
+        tier: For imagenav: goals 2 to 5 m away, 5 to 8 m away, or one corner beyond what the start sees, where the way
+            forks; all: the three in turn.
         seed: Seed; with the scenes, it determines the episodes.
         backend: Renderer, for checking that goals are out of sight; auto if not given.
         attributes: For aeqa and a scene from a file: JSON of what more is known of its instances, by their names, such
             as {"Desk_01": {"color": "brown", "state": "open"}}.
         task_option: Another option of the task, such as categories=bed,sofa or, for scans, goal_instances=1; may be
             given again.
+        sheet: For imagenav: where to draw up to 12 of the episodes: scene from above with the floor that the start sees
+            (yellow), the ways on and the shortest path, then the start's panorama and the goal's view.
         overwrite: Whether to replace an existing file.
     """
     from wiw.datasets.episodes import save
@@ -57,7 +64,7 @@ def episodes(
     if out.exists() and not overwrite:
         raise ArgumentError(f"{out} is there already; give --overwrite to replace it, or another name with --out")
     more = {} if attributes is None else {"attributes": str(attributes)}
-    flags = {"scenes": scenes, "seed": seed, "backend": backend, "per_scene": per_scene, **more}
+    flags = {"scenes": scenes, "seed": seed, "backend": backend, "per_scene": per_scene, "tier": tier, **more}
     made = TASKS.make(task, **task_options(task, task_option, flags))
     if made.file_header is None:
         raise ArgumentError(
@@ -77,4 +84,8 @@ def episodes(
     for remark in made.explain_episodes(found):
         print(remark)
     print(f"episodes  {out}")
+    if sheet is not None:
+        from wiw.viz.episode_sheet import save_sheet
+
+        print(f"sheet     {save_sheet(made, found, sheet)}")
     return 0

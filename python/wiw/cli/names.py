@@ -11,12 +11,23 @@ from rich.markup import escape
 from tyro.conf import Positional
 
 What = Literal[
-    "all", "world-models", "policies", "trackers", "tasks", "presets", "metrics", "errors", "vlm-models", "prompts"
+    "all",
+    "world-models",
+    "policies",
+    "trackers",
+    "tasks",
+    "presets",
+    "tiers",
+    "studies",
+    "metrics",
+    "errors",
+    "vlm-models",
+    "prompts",
 ]
 
 
 def list_names(what: Positional[What] = "all", /) -> int:
-    """List everything with a name: world models, policies, trackers, tasks, presets, metrics, errors, VLMs and prompts.
+    """List everything with a name: world models, policies, tasks, presets, studies, metrics, VLMs, prompts and so on.
 
     $ wiw list
     $ wiw list world-models
@@ -57,7 +68,14 @@ def _make_table(what: str) -> Any:
         name: lambda table, name=name, registry=registry: _add_registry(table, name, registry)  # type: ignore[misc]
         for name, registry in registries.items()
     }
-    sections |= {"errors": _add_errors, "presets": _add_presets, "vlm-models": _add_vlm_models, "prompts": _add_prompts}
+    sections |= {
+        "errors": _add_errors,
+        "presets": _add_presets,
+        "tiers": _add_tiers,
+        "studies": _add_studies,
+        "vlm-models": _add_vlm_models,
+        "prompts": _add_prompts,
+    }
     if what == "presets":
         _add_presets(table, detailed=True)
         return table
@@ -101,6 +119,26 @@ def _add_errors(table: Any) -> None:
     table.add_row("[bold]Errors of futures[/]", "[dim]--arms error-KIND@DOSE[:MODEL]; of the oracle without MODEL[/]")
     for name, kind in ERRORS.items():
         table.add_row(f"  {name}", f"{escape(kind.about)} [dim]Dose: {escape(kind.unit)}.[/]")
+    table.add_row()
+
+
+def _add_tiers(table: Any) -> None:
+    from wiw.datasets.imagenav import TIERS
+
+    table.add_row("[bold]Tiers of imagenav[/]", "[dim]--tier NAME, or all of them in turn: --tier all[/]")
+    for name, tier in TIERS.items():
+        table.add_row(f"  {name}", tier.about)
+    table.add_row()
+
+
+def _add_studies(table: Any) -> None:
+    from wiw.cli.study import STUDIES
+    from wiw.studies.study_file import list_studies
+
+    table.add_row("[bold]Studies[/]", "[dim]wiw study NAME, or a YAML file of your own[/]")
+    own = {name: line for _, name, line in STUDIES}
+    for name, line in {**own, **list_studies()}.items():
+        table.add_row(f"  {name}", escape(line))
     table.add_row()
 
 

@@ -41,6 +41,9 @@ class TaskFlags:
     (hm3d:DIR:val, mp3d:DIR, replica:DIR, hssd:DIR, replicacad:DIR, procthor:DIR); apartments:val if not given."""
     per_scene: Annotated[int | None, arg(metavar="N")] = None
     """Episodes generated in a scene before the next one's turn; the task's own number if not given."""
+    tier: Literal["near", "far", "beyond", "all"] | None = None
+    """For imagenav: goals 2 to 5 m away, 5 to 8 m away, or one corner beyond what the start sees, where the way forks;
+    all: the three in turn, each with tables of its own."""
     episode_file: Annotated[Path | None, arg(metavar="FILE")] = None
     """Episodes to run instead of generated ones, from `wiw episodes`, habitat-lab or World-in-World."""
     scene_folder: Folder = None

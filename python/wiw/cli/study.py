@@ -1,8 +1,9 @@
 # SPDX-License-Identifier: Apache-2.0
-"""`wiw study data-scaling` and `wiw study errors`."""
+"""`wiw study data-scaling`, `wiw study errors`, and all studies that are commands of their own (`STUDIES`)."""
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -174,3 +175,10 @@ def study_errors(
     for path in found.save():
         print(path)
     return 0
+
+
+STUDIES: tuple[tuple[Callable[..., int], str, str], ...] = (
+    (study_data_scaling, "data-scaling", "Does a world model get better with data, or with updates?"),
+    (study_errors, "errors", "What kind of error of imagined futures costs success?"),
+)
+"""Studies with commands of their own: function, name and summary; the others are YAML files."""

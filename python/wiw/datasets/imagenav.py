@@ -5,18 +5,50 @@ from __future__ import annotations
 
 import logging
 from collections import Counter
+from collections.abc import Mapping
 from dataclasses import dataclass, replace
+from typing import Literal
 
 import numpy as np
 from numpy.typing import NDArray
 
 from wiw._core import core
+from wiw.datasets.cameras import camera_pose, is_in_view
+from wiw.datasets.ways_on import NO_FORK, SEEN_AROUND, TWO_CORNERS, find_broken_rule
 from wiw.datasets.worlds import World
-from wiw.errors import ArgumentError
+from wiw.errors import ArgumentError, EpisodesError
 from wiw.types import Episode
 
-CAMERA_HEIGHT = 1.0
 _log = logging.getLogger("wiw.datasets")
+
+TierName = Literal["any", "near", "far", "beyond", "all"]
+_LENGTH, _BUDGET, _IN_SIGHT, _DULL_GOAL = (
+    "shortest, longest",
+    "budget",
+    "the goal out of sight of the start",
+    "goal_depth, goal_instances",
+)
+RULES = (_LENGTH, _BUDGET, _IN_SIGHT, _DULL_GOAL, SEEN_AROUND, NO_FORK, TWO_CORNERS)
+"""Rules, in the order in which they are checked."""
+ATTEMPTS = 10
+"""Factor on the pairs tried per episode of a tier, since lengths are drawn from a part of the tier's range."""
+
+
+@dataclass(frozen=True)
+class Tier:
+    """Lengths of a tier's episodes, in metres and primitives."""
+
+    shortest: float
+    longest: float
+    budget: int
+    about: str
+
+
+TIERS: Mapping[str, Tier] = {
+    "near": Tier(2.0, 5.0, 42, "goals 2 to 5 m away, out of sight"),
+    "far": Tier(5.0, 8.0, 48, "goals 5 to 8 m away, out of sight"),
+    "beyond": Tier(3.0, 7.0, 42, "goals 3 to 7 m away, one corner beyond what the start sees, where the way forks"),
+}
 
 
 @dataclass(frozen=True)
@@ -34,7 +66,24 @@ class EpisodeRules:
     """Least number of things in the goal view, the outside counted. In a scene of fewer, such as a scan that is one
     mesh, nothing is asked of their number."""
     attempts: int = 400
-    """Pairs tried per episode before giving up."""
+    """Pairs tried per episode before giving up; ten times as many within a tier."""
+    tier: TierName = "any"
+    """near, far or beyond (`TIERS`), which sets shortest, longest and budget; all: the three in turn; any: none."""
+
+    def __post_init__(self) -> None:
+        given = [
+            name for name in ("shortest", "longest", "budget") if getattr(self, name) != getattr(EpisodeRules, name)
+        ]
+        if self.tier != "any" and given:
+            raise ArgumentError(
+                f"imagenav: tier '{self.tier}' sets shortest, longest and budget; expected none of them beside it, got "
+                f"{', '.join(given)}. Leave that out, or the tier"
+            )
+
+    @property
+    def tiers(self) -> tuple[str, ...]:
+        """Tiers that episodes are of, in turn; empty where they are of none."""
+        return {"any": (), "all": tuple(TIERS)}.get(self.tier, (self.tier,))
 
 
 def generate(
@@ -42,11 +91,34 @@ def generate(
 ) -> list[Episode]:
     """Return episodes `first` to `first + count - 1` of one scene, each a function of (scene, seed, its number) alone.
 
+    Within tiers `count` episodes of each are returned, the tiers in turn. Their lengths are spread evenly: a tier's
+    range is cut into `count` parts, each for one episode, so that an episode is a function of `count`, too.
+
     Raises:
-        ArgumentError: the scene has too few pairs of places that satisfy `rules`; says which rules they broke.
+        EpisodesError: the scene has too few pairs of places that satisfy `rules`; says which rules they broke.
     """
     rules = _fit_rules(world, rules)
-    return [_episode(world, index, seed, rules) for index in range(first, first + count)]
+    if not rules.tiers:
+        return [_episode(world, index, seed, rules) for index in range(first, first + count)]
+    turns = [(tier, part) for part in range(count) for tier in rules.tiers]
+    return [
+        _episode(world, index, seed, _fit_part(rules, tier, part, count), tier)
+        for index, (tier, part) in enumerate(turns, start=first)
+    ]
+
+
+def _fit_part(rules: EpisodeRules, tier: str, part: int, parts: int) -> EpisodeRules:
+    """Return the rules of an episode of a tier, whose length lies in one of equal parts of the tier's range."""
+    own = TIERS[tier]
+    share = (own.longest - own.shortest) / parts
+    return replace(
+        rules,
+        tier="any",
+        shortest=own.shortest + part * share,
+        longest=own.shortest + (part + 1) * share,
+        budget=own.budget,
+        attempts=ATTEMPTS * rules.attempts,
+    )
 
 
 def _fit_rules(world: World, rules: EpisodeRules) -> EpisodeRules:
@@ -60,7 +132,8 @@ def _fit_rules(world: World, rules: EpisodeRules) -> EpisodeRules:
     return replace(rules, goal_instances=0)
 
 
-def _episode(world: World, index: int, seed: int, rules: EpisodeRules) -> Episode:
+def _episode(world: World, index: int, seed: int, rules: EpisodeRules, tier: str = "") -> Episode:
+    """Return an episode that satisfies `rules`, and what its tier asks beside a length."""
     key = core.fold_key([seed, index, 0x1A6E])
     points = world.ground.put_down(world.navmesh.sample(2 * rules.attempts, key))
     draws = core.uniform(core.fold_key([key, 1]), 5 * rules.attempts).reshape(-1, 5)
@@ -68,19 +141,23 @@ def _episode(world: World, index: int, seed: int, rules: EpisodeRules) -> Episod
     for start, goal, draw in zip(points[::2], points[1::2], draws, strict=True):
         geodesic = float(world.navmesh.geodesic_distance(start, goal))
         if not rules.shortest <= geodesic <= rules.longest:
-            broken["shortest, longest"] += 1
+            broken[_LENGTH] += 1
             continue
         start_yaw = float(2 * np.pi * draw[0])
         ideal = ideal_primitives(np.asarray(world.navmesh.shortest_path(start, goal)), start_yaw)
         if ideal > rules.budget:
-            broken["budget"] += 1
+            broken[_BUDGET] += 1
             continue
         if is_in_view(world, start, goal):
-            broken["the goal in sight of the start"] += 1
+            broken[_IN_SIGHT] += 1
             continue
         goal_yaw = _best_view(world, goal, 2 * np.pi * draw[1:], rules)
         if goal_yaw is None:
-            broken["goal_depth, goal_instances"] += 1
+            broken[_DULL_GOAL] += 1
+            continue
+        rule = find_broken_rule(world, start, goal) if tier == "beyond" else None
+        if rule is not None:
+            broken[rule] += 1
             continue
         return Episode(
             episode_id=f"{index:04d}",
@@ -90,12 +167,25 @@ def _episode(world: World, index: int, seed: int, rules: EpisodeRules) -> Episod
             goal_position=_triple(goal),
             goal_yaw=goal_yaw,
             geodesic=geodesic,
-            info={"ideal_primitives": ideal},
+            info={"ideal_primitives": ideal, **({"tier": tier} if tier else {})},
         )
-    reasons = ", ".join(f"{count} broke {rule}" for rule, count in broken.most_common())
-    raise ArgumentError(
-        f"{world.name}: no start and goal among {rules.attempts} satisfy {rules}: {reasons}. Loosen one "
-        "(--task-option goal_depth=0.8, or goal_depth=0.8 in Python), or raise attempts"
+    raise _explain_failure(world, rules, tier, broken)
+
+
+def _explain_failure(world: World, rules: EpisodeRules, tier: str, broken: Counter[str]) -> EpisodesError:
+    """Return the error of a scene without a pair of places that satisfies the rules, which are checked in turn."""
+    rule = next(each for each in reversed(RULES) if each in broken)
+    reasons = ", ".join(f"{count} broke {each}" for each, count in broken.most_common())
+    asked = f"episodes of tier '{tier}', " if tier else ""
+    loosen = (
+        "Choose a larger scene, another tier, or more attempts (--task-option attempts=2000)"
+        if tier
+        else "Loosen one (--task-option goal_depth=0.8, or goal_depth=0.8 in Python), or raise attempts"
+    )
+    return EpisodesError(
+        f"{world.name}: {asked}no start and goal among {rules.attempts} satisfy {rules}: {reasons}. What got furthest "
+        f"broke {rule}. {loosen}",
+        rule,
     )
 
 
@@ -107,27 +197,6 @@ def ideal_primitives(path: NDArray[np.float64], yaw: float, step: float = 0.2, t
     turns = np.diff(np.concatenate([[yaw], headings]))
     turns = np.abs(np.remainder(turns + np.pi, 2 * np.pi) - np.pi)
     return int(np.round(turns / turn).sum() + np.ceil(np.linalg.norm(legs, axis=1).sum() / step))
-
-
-def is_in_view(world: World, start: NDArray[np.float64], goal: NDArray[np.float64], margin: float = 0.3) -> bool:
-    """Return whether the goal camera's position is visible from the start camera's, by the depth along the ray."""
-    eye, place = (np.add(p, [0.0, CAMERA_HEIGHT, 0.0]) for p in (start, goal))
-    way = place - eye
-    pose = camera_pose(start, float(np.arctan2(-way[0], -way[2])))
-    pitch = np.arctan2(way[1], np.hypot(way[0], way[2]))
-    depth = world.renderer.panorama(pose[None], (64, 128), outputs=("depth",))["depth"][0]
-    row = int((0.5 - pitch / np.pi) * 64)
-    seen = depth[max(row - 1, 0) : row + 2, 63:65]
-    return bool((seen == 0).any() or seen.max() > np.linalg.norm(way) - margin)
-
-
-def camera_pose(position: NDArray[np.float64], yaw: float, height: float = CAMERA_HEIGHT) -> NDArray[np.float64]:
-    """Return T_world_camera [4, 4] of an agent at `position` on the floor, heading `yaw` radians."""
-    pose = np.eye(4)
-    pose[0, 0] = pose[2, 2] = np.cos(yaw)
-    pose[0, 2], pose[2, 0] = np.sin(yaw), -np.sin(yaw)
-    pose[:3, 3] = np.add(position, [0.0, height, 0.0])
-    return pose
 
 
 def _best_view(world: World, goal: NDArray[np.float64], yaws: NDArray[np.float64], rules: EpisodeRules) -> float | None:

@@ -11,7 +11,7 @@ from collections.abc import Callable, Iterator, Mapping
 from pathlib import Path
 from typing import Any
 
-from wiw.analysis.summary import arm_table, summarise_run
+from wiw.analysis.summary import arm_table, summarise_run, tier_table
 from wiw.errors import ArgumentError
 from wiw.files import atomic_file, atomic_folder
 from wiw.runs.rows import to_json
@@ -49,12 +49,14 @@ def tables(run: Run) -> dict[str, Table]:
     """Return the run as tables of plain values, by name: arms, episodes, outcomes, decisions, candidates.
 
     Ended episodes only; a metric is a column of outcomes, seconds and counts are columns of decisions. Where the task
-    has them: kinds, anytime, anytime_differences, twins, and judgements, by all judges.
+    has them: tiers, kinds, anytime, anytime_differences, twins, and judgements, by all judges.
     """
     decisions = run.store.decisions()
     further: dict[str, Table] = {}
     for breakdown in summarise_run(run).breakdowns:
         further.setdefault(breakdown.name, []).extend(breakdown.list_cells())
+    if tiers := tier_table(run):
+        further["tiers"] = [dict(line) for line in tiers]
     if judgements := list_judgements(run):
         further["judgements"] = judgements
     return {

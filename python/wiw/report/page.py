@@ -103,7 +103,10 @@ def render(run: Run, episodes: int | None = None, scale: float = 1.0, remark: st
             words=wording(run.store),
             whole=Album.whole,
             remark=remark,
-            sentence=sentence(summary, wording(run.store)),
+            sentence="" if summary.tiers else sentence(summary, wording(run.store)),
+            tiers=[
+                {**tier, "sentence": sentence(tier["summary"], wording(run.store))} for tier in _list_tiers(summary)
+            ],
             terms=explain_metrics(summary, wording(run.store)),
             plots=_plots(run, summary, truths, blamed),
             stories=shown,
@@ -128,7 +131,17 @@ def render(run: Run, episodes: int | None = None, scale: float = 1.0, remark: st
 
 def summary_html(summary: Summary) -> str:
     """Return the tables alone, for Jupyter."""
-    return environment().get_template("summary.html.j2").render(**_common(summary))
+    return environment().get_template("summary.html.j2").render(**list_table_values(summary))
+
+
+def list_table_values(summary: Summary, more: Sequence[Difference] = ()) -> dict[str, Any]:
+    """Return what the macros for tables take; `more` are differences that are shown besides the summary's."""
+    reach = _reach([*summary.differences, *more])
+    return {**_common(summary), "reach": reach, "tiers": _list_tiers(summary)}
+
+
+def _list_tiers(summary: Summary) -> list[dict[str, Any]]:
+    return [{**_common(own), "name": tier} for tier, own in summary.tiers.items()]
 
 
 def sentence(summary: Summary, words: Wording | None = None) -> str:

@@ -28,7 +28,7 @@ def write_quality(table: QualityTable, pictures: Mapping[str, Sequence[Any]], nu
     Raises:
         FileError: it cannot be written.
     """
-    drawn = _measures(table)
+    drawn = list_drawn_measures(table)
     contents = {
         "quality.html": render_quality(table, pictures).encode(),
         "quality.svg": plots.draw_success_by_measures(table, drawn, "svg"),
@@ -51,7 +51,7 @@ def render_quality(table: QualityTable, pictures: Mapping[str, Sequence[Any]]) -
             label,
             dict(zip(RANK_TITLES, show_rank(ranks[name]), strict=True)),
         )
-        for name, label in _measures(table).items()
+        for name, label in list_drawn_measures(table).items()
     ]
     return (
         environment()
@@ -74,7 +74,7 @@ def render_quality(table: QualityTable, pictures: Mapping[str, Sequence[Any]]) -
     )
 
 
-def _measures(table: QualityTable) -> dict[str, str]:
+def list_drawn_measures(table: QualityTable) -> dict[str, str]:
     """Return the measures that are drawn, with labels: quality, and controllability where it is known."""
     names = [table.quality, *([table.control] if table.control else [])]
     return {name: label_measure(table, name) for name in names}

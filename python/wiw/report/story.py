@@ -243,5 +243,5 @@ def place(scene: str) -> str:
 
 
 def where(episode: Episode) -> str:
-    """Return the kind of an episode where its task has several, else its scene's name without its folders."""
-    return episode.kind.replace("_", " ") or place(episode.scene)
+    """Return the kind of an episode where its task has several, else its scene's name without its folders, and tier."""
+    return episode.kind.replace("_", " ") or " · ".join(filter(None, (place(episode.scene), episode.tier)))

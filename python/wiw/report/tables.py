@@ -64,10 +64,22 @@ class SummaryTable(Summary):
         return summary_html(self)
 
 
-def print_summary(summary: SummaryTable) -> None:
-    """Print the tables, as wide as the terminal; for a file or a pipe at least `ROOMY` columns wide."""
-    console = Console()
-    Console(width=None if console.is_terminal else max(console.width, ROOMY)).print(summary)
+def print_summary(summary: SummaryTable, heading: str = "", compared: Group | None = None) -> None:
+    """Print the tables, as wide as the terminal; for a file or a pipe at least `ROOMY` columns wide.
+
+    Args:
+        summary: the numbers.
+        heading: printed before them.
+        compared: further differences, printed after them.
+    """
+    plain = Console()
+    console = Console(width=None if plain.is_terminal else max(plain.width, ROOMY))
+    if heading:
+        console.print(Text(heading, style="bold underline"))
+    console.print(summary)
+    if compared is not None:
+        gap = " " if console.width >= ROOMY else "\n"
+        console.print(Lines(*_difference_tables(summary, compared, gap, console.width)))
 
 
 def as_text(summary: SummaryTable) -> str:
@@ -151,7 +163,17 @@ def stack_tables(
 
 
 def summary_tables(summary: Summary, width: int) -> Any:
-    """Return what rich prints into `width` columns."""
+    """Return what rich prints into `width` columns: all tables, then the arms and differences of each tier."""
+    parts: list[Any] = [Text("All tiers", style="bold underline")] if summary.tiers else []
+    parts += _list_tables(summary, width)
+    for tier, own in summary.tiers.items():
+        parts += [Text(f"Tier {tier}", style="bold underline"), *_list_tables(own, width)]
+    styled = [Text(note, style="bold red" if note.startswith("INVALID") else "dim") for note in notes(summary)]
+    return Lines(*parts, *styled)
+
+
+def _list_tables(summary: Summary, width: int) -> list[Any]:
+    """Return all tables of a summary but for those of its tiers."""
     gap = " " if width >= ROOMY else "\n"
     parts: list[Any] = [Text(summary.protocol, style="dim")] if summary.protocol else []
     parts += _arm_tables(summary, width)
@@ -161,8 +183,7 @@ def summary_tables(summary: Summary, width: int) -> Any:
         parts += _breakdown_tables(breakdown, "\n" if len(breakdown.columns) > NARROW else " ", width)
     for group in summary.groups():
         parts += _difference_tables(summary, group, gap, width)
-    styled = [Text(note, style="bold red" if note.startswith("INVALID") else "dim") for note in notes(summary)]
-    return Lines(*parts, *styled)
+    return parts
 
 
 def _table(title: str) -> Table:

@@ -136,7 +136,9 @@ def _compare_episodes(task: Task, count: int) -> Iterator[Departure]:
     wanted, place = EPISODES[task.name]
     file, scenes = task.describe().get("episode_file"), task.describe().get("scenes")
     if file is None and task.name != "manipulation":
-        yield Departure("episodes", f"generated in {scenes} (paper: {wanted} of {place})")
+        tier = task.describe().get("generator", {}).get("tier")
+        where = f"{scenes}, tier {tier}" if tier else scenes
+        yield Departure("episodes", f"generated in {where} (paper: {wanted} of {place})")
     elif count != wanted:
         found = count if file is None else f"{count} of {Path(file).name}"
         yield Departure("episodes", f"{found} (paper: {wanted} of {place})")

@@ -20,11 +20,11 @@ FLOORS, CEILING, CONTROL = ("copy", "none"), "oracle", "placebo"
 
 
 def spread_evenly(episodes: Sequence[Episode], count: int) -> list[int]:
-    """Return `count` indices spread evenly over the episodes, and the first of each kind that has none among them."""
+    """Return `count` indices spread evenly over the episodes, and the first of each group that has none among them."""
     count, last = min(count, len(episodes)), len(episodes) - 1
     chosen = {round(i * last / max(1, count - 1)) for i in range(count)}
     for index, episode in enumerate(episodes):
-        if count and episode.kind not in {episodes[other].kind for other in chosen}:
+        if count and episode.group not in {episodes[other].group for other in chosen}:
             chosen.add(index)
     return sorted(chosen)
 
@@ -42,14 +42,14 @@ def choose_episodes(
     """Return the episodes that keep their pictures, the first of them being the one to show first.
 
     They are spread evenly over the run; an episode of the pool in which a model succeeds and the floor fails takes the
-    place of the nearest of its kind, unless there is such an episode among them.
+    place of the nearest of its group, unless there is such an episode among them.
     """
     chosen = spread_evenly(episodes, count)
     gains = {index: _rate_gain(index, outcomes) for index in {*pool, *chosen}}
     best = max(sorted(gains), key=lambda index: (gains[index], index in chosen), default=None)
     if best is None or gains[best] == (0, 0):
         return chosen
-    rivals = [index for index in chosen if episodes[index].kind == episodes[best].kind]
+    rivals = [index for index in chosen if episodes[index].group == episodes[best].group]
     if best not in chosen and rivals:
         chosen.remove(min(rivals, key=lambda index: abs(index - best)))
     return [best, *(index for index in chosen if index != best)]

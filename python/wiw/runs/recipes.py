@@ -460,12 +460,22 @@ def _make_arm(agent: AgentRecipe, name: str | None, model: Any) -> tuple[str, Ag
     changed = own if of_model is None else _change_model(own, of_model)
     changed = _with_options(replace(changed, reseed=1) if repeats else changed, arm)
     given = arm.name if name is None else name
-    is_changed = changed.placebo is not None or changed.error is not None or repeats
-    if given in REFERENCES and (changed.arm != given or is_changed):
+    name = given or _name_arm(policy, changed.arm if of_model is None else of_model, repeats)
+    return name, changed if given is None else require_reference(given, changed)
+
+
+def require_reference(name: str, agent: AgentRecipe) -> AgentRecipe:
+    """Return an arm's agent as it is.
+
+    Raises:
+        ArgumentError: the arm has the name of a reference, and the agent another world model, or one that is changed.
+    """
+    is_changed = any(change is not None for change in (agent.placebo, agent.error, agent.reseed))
+    if name in REFERENCES and (agent.arm != name or is_changed):
         raise ArgumentError(
-            f"arms: reports take the arm '{given}' for the reference '{given}', got {arm.model}; choose another name"
+            f"arms: reports take the arm '{name}' for the reference '{name}', got {agent.model}; choose another name"
         )
-    return given or _name_arm(policy, changed.arm if of_model is None else of_model, repeats), changed
+    return agent
 
 
 def _change_model(agent: AgentRecipe, text: str) -> AgentRecipe:

@@ -12,7 +12,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from wiw import panorama
-from wiw.datasets.imagenav import EpisodeRules, camera_pose, generate, ideal_primitives
+from wiw.datasets.cameras import camera_pose
+from wiw.datasets.imagenav import EpisodeRules, generate, ideal_primitives
 from wiw.datasets.worlds import World
 from wiw.envs.episode_state import EpisodeState
 from wiw.errors import ArgumentError, FileError
@@ -122,6 +123,11 @@ class ImageNav(NavigationTask):
         if "radius" not in self.overridden:
             return loaded
         return [replace(e, info={name: value for name, value in e.info.items() if name != "radius"}) for e in loaded]
+
+    @property
+    def block(self) -> int:
+        """Episodes generated in a scene at a time: `per_scene` of each tier."""
+        return self.per_scene * max(1, len(self.generator.tiers))
 
     def generate_episodes(self, place: World, first: int, before: list[Episode]) -> list[Episode]:
         """Return episodes with goals out of sight of the start, yet within reach."""

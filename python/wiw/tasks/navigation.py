@@ -32,7 +32,7 @@ class NavigationTask(NavigationSpec, Task):
         episode_file: a JSON episode file to use instead of generating; habitat-lab's and World-in-World's are read too.
         scene_folder: folder that scene paths in an episode file are relative to; if not given, the folder of a file of
             wiw, else the present one.
-        per_scene: generated episodes a scene.
+        per_scene: generated episodes a scene; of each tier, where there are several.
         backend: renderer, "auto", "cpu" or "gpu".
         rules: rules of the task, and of the generator (`generator_class`).
     """
@@ -77,7 +77,7 @@ class NavigationTask(NavigationSpec, Task):
         return episode_file.load(self.episode_file, self.scene_folder)
 
     def generate_episodes(self, place: World, first: int, before: list[Episode]) -> list[Episode]:
-        """Return `per_scene` generated episodes of a scene, from its number `first` on, after those `before`."""
+        """Return a `block` of generated episodes of a scene, from its number `first` on, after those `before`."""
         raise NotImplementedError(f"{type(self).__name__}: write generate_episodes, or generate_first for all scenes")
 
     # ------------------------------------------------------------------------------------------------------------------
@@ -119,7 +119,12 @@ class NavigationTask(NavigationSpec, Task):
         if self.episode_file:
             return len(self._read_file())
         scenes = resolve(self.scenes)
-        return None if len(scenes) == 1 else len(scenes) * self.per_scene
+        return None if len(scenes) == 1 else len(scenes) * self.block
+
+    @property
+    def block(self) -> int:
+        """Episodes generated in a scene at a time."""
+        return self.per_scene
 
     @property
     def default_episodes(self) -> int:
@@ -155,7 +160,7 @@ class NavigationTask(NavigationSpec, Task):
         return VectorEnv(self, num_envs, depth)
 
     def episodes(self, count: int) -> list[Episode]:
-        """Return the first `count` episodes; generated scene by scene, `per_scene` each.
+        """Return the first `count` episodes; generated scene by scene, a `block` each.
 
         Raises:
             ArgumentError: the episode file or the scenes hold fewer.
@@ -167,7 +172,7 @@ class NavigationTask(NavigationSpec, Task):
         return self._episodes[:count]
 
     def generate_first(self, count: int) -> list[Episode]:
-        """Return the first `count` generated episodes: scene by scene, `per_scene` each, all of a single scene.
+        """Return the first `count` generated episodes: scene by scene, a `block` each, all of a single scene.
 
         Raises:
             ArgumentError: the scenes give fewer.
@@ -176,14 +181,14 @@ class NavigationTask(NavigationSpec, Task):
         whole_scene = len(scenes) == 1
         made = list(self._episodes)
         while len(made) < count:
-            done = len(made) // self.per_scene
+            done = len(made) // self.block
             if not whole_scene and done >= len(scenes):
                 raise ArgumentError(
                     f"{self.name}: asked for {count} episodes, but there are {len(made)}; "
                     "name more scenes (apartments:SPLIT:N) or raise per_scene"
                 )
             place = world(scenes[0] if whole_scene else scenes[done], self.backend)
-            block = self.generate_episodes(place, self.per_scene * done if whole_scene else 0, made)
+            block = self.generate_episodes(place, self.block * done if whole_scene else 0, made)
             made += [replace(episode, episode_id=f"{len(made) + i:04d}") for i, episode in enumerate(block)]
         return made
 

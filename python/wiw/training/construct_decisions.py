@@ -16,8 +16,8 @@ from numpy.typing import NDArray
 
 from wiw._core import core
 from wiw.action import FORWARD, TURN_LEFT, TURN_RIGHT
+from wiw.datasets.cameras import camera_pose
 from wiw.datasets.decisions import Decisions, join_decisions
-from wiw.datasets.imagenav import camera_pose
 from wiw.datasets.worlds import World, world
 from wiw.errors import ArgumentError
 from wiw.scenes import resolve

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from wiw._core import core
 from wiw.datasets.ar import CATEGORIES, category_of
-from wiw.datasets.imagenav import camera_pose
+from wiw.datasets.cameras import camera_pose
 from wiw.datasets.visibility import COARSE, measure_sizes
 from wiw.datasets.worlds import World
 from wiw.errors import ArgumentError

@@ -12,7 +12,7 @@ from typing import Any, Literal, get_args
 import numpy as np
 from numpy.typing import NDArray
 
-from wiw.datasets.imagenav import CAMERA_HEIGHT, camera_pose
+from wiw.datasets.cameras import CAMERA_HEIGHT, camera_pose
 from wiw.datasets.navigation_segment import NavigationSegment, encode_color, encode_millimetres
 from wiw.datasets.worlds import World
 from wiw.errors import ArgumentError

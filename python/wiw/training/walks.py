@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from wiw._core import core
-from wiw.datasets.imagenav import camera_pose
+from wiw.datasets.cameras import camera_pose
 from wiw.datasets.worlds import World
 from wiw.errors import ArgumentError
 

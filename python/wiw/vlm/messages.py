@@ -155,6 +155,8 @@ class Reply:
     """Whether JSON syntax errors were repaired."""
     problem: Problem | None = None
     completions: tuple[CompletionRecord, ...] = field(default=(), repr=False)
+    model: str = ""
+    """Name of the model that was asked, where the asker has several."""
 
     @property
     def mass(self) -> float | None:

@@ -6,12 +6,13 @@ from __future__ import annotations
 from collections import defaultdict
 from collections.abc import Sequence
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from wiw.errors import ArgumentError
-from wiw.types import GRIPPER_POSES, PRIMITIVES, Conditioning, Control
+from wiw.types import GRIPPER_POSES, PRIMITIVES, Conditioning, Control, View
 from wiw.world_models.base import WorldModel, accepts
 
 
@@ -24,25 +25,35 @@ class Oracle(WorldModel):
     Args:
         size: height and width of its frames; 576x1024, or 480x480 before a table, where None. A policy that looks at
             smaller frames loses nothing by less.
+        view: "perspective" for front views alone in place of panoramas; before a table there is no other.
 
     Raises:
-        ArgumentError: no size.
+        ArgumentError: no size, or a view that the plans do not lead through.
     """
 
     accepts = accepts(control="action", view="panorama", needs=("simulator",), causal=True, best_batch=64)
 
-    def __init__(self, size: Sequence[int] | None = None) -> None:
-        if size is None:
-            return
-        if len(size) != 2 or min(size) < 1:
+    def __init__(self, size: Sequence[int] | None = None, view: View | None = None) -> None:
+        own = type(self).accepts
+        if size is not None and (len(size) != 2 or min(size) < 1):
             raise ArgumentError(f"oracle: expected size [height, width] in pixels, got {size}")
-        self.size = int(size[0]), int(size[1])
-        self.accepts = replace(type(self).accepts, size=self.size)
+        if size is not None:
+            self.size = int(size[0]), int(size[1])
+        if view == "panorama" and own.space != PRIMITIVES:
+            raise ArgumentError(
+                f"oracle: expected front views (view='perspective') of plans in {own.space}, got '{view}'"
+            )
+        if view not in (None, own.view):
+            self.view = view
+        if vars(self):  # view and size are named in the manifest where they are chosen
+            shown = view or own.view
+            usual = own.size if shown == own.view else accepts("image", shown).size
+            self.accepts = replace(own, view=shown, size=usual if size is None else self.size)
 
     def rollout(
         self, observations: Conditioning, controls: Sequence[Control], seeds: NDArray[np.uint64]
     ) -> NDArray[np.uint8]:
-        """Return true panoramas; frames that another row answers and frames of padding are left unwritten."""
+        """Return true views; frames that another row answers and frames of padding are left unwritten."""
         assert observations.simulators is not None
         image = observations.image
         frames = np.empty((len(controls), 1 + len(controls[0].actions), *image.shape[1:]), np.uint8)
@@ -57,9 +68,16 @@ class Oracle(WorldModel):
             if views:
                 rows, steps, poses = zip(*views, strict=True)
                 pictures = np.empty((len(views), *image.shape[1:]), np.uint8)
-                renderers[name].panorama(np.stack(poses), image.shape[1:3], pictures, None, None)
+                self._draw(renderers[name], np.stack(poses), pictures)
                 frames[list(rows), list(steps)] = pictures
         return frames
+
+    def _draw(self, renderer: Any, poses: NDArray[np.float64], pictures: NDArray[np.uint8]) -> None:
+        """Render the views from poses [N, 4, 4] into `pictures`, uint8 [N, H, W, 3]."""
+        if self.accepts.view == "perspective":
+            renderer.perspective(poses, pictures.shape[1:3], 90.0, pictures, None, None)
+        else:
+            renderer.panorama(poses, pictures.shape[1:3], pictures, None, None)
 
 
 class ArmOracle(Oracle):
@@ -81,14 +99,14 @@ class ArmOracle(Oracle):
         return frames
 
 
-def make_oracle(space: str = PRIMITIVES, size: Sequence[int] | None = None) -> Oracle:
+def make_oracle(space: str = PRIMITIVES, size: Sequence[int] | None = None, view: View | None = None) -> Oracle:
     """Carry each plan out in a fork of the simulator.
 
-    Return the model for plans of a space; `size` as for `Oracle`.
+    Return the model for plans of a space; `size` and `view` as for `Oracle`.
     """
     made = {PRIMITIVES: Oracle, GRIPPER_POSES: ArmOracle}.get(space)
     if made is None:
         raise ArgumentError(
             f"oracle: expected plans in {PRIMITIVES} or {GRIPPER_POSES}, got '{space}'; write one for yours"
         )
-    return made(size)
+    return made(size, view)

@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from wiw.reproject import warp
-from wiw.types import Conditioning, Control
+from wiw.types import Conditioning, Control, View
 from wiw.world_models.base import WorldModel, accepts
 
 
@@ -23,10 +23,23 @@ class Warp(WorldModel):
     accepts = accepts(control="trajectory", view="panorama", needs=("depth",), causal=True, best_batch=64)
     version = "1"
 
+    def __init__(self, view: View = "panorama", size: tuple[int, int] | None = None) -> None:
+        """Make the model.
+
+        Args:
+            view: "panorama", or "perspective" for a model that sees and draws the front view alone.
+            size: (height, width) of input and output; 576x1024, in a front view 480x480, if not given.
+        """
+        if (view, size) != ("panorama", None):  # named in the manifest only where they are chosen
+            self.view, self.size = view, size
+            self.accepts = accepts(
+                control="trajectory", view=view, size=size, needs=("depth",), causal=True, best_batch=64
+            )
+
     def rollout(
         self, observations: Conditioning, controls: Sequence[Control], seeds: NDArray[np.uint64]
     ) -> NDArray[np.uint8]:
-        """Return reprojected panoramas; frames that another row answers and frames of padding are left unwritten."""
+        """Return reprojected views; frames that another row answers and frames of padding are left unwritten."""
         assert observations.depth is not None
         frames = np.empty((len(controls), 1 + len(controls[0].actions), *observations.image.shape[1:]), np.uint8)
         frames[:, 0] = observations.image
@@ -37,5 +50,6 @@ class Warp(WorldModel):
                     observations.image[row : row + 1],
                     observations.depth[row : row + 1],
                     control.viewpoints[None, wanted],
+                    hfov_deg=90.0 if self.accepts.view == "perspective" else None,
                 )[0]
         return frames

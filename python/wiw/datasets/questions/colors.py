@@ -8,7 +8,7 @@ from collections.abc import Sequence
 import numpy as np
 from numpy.typing import NDArray
 
-from wiw.datasets.imagenav import camera_pose
+from wiw.datasets.cameras import camera_pose
 from wiw.datasets.questions.question import Viewpoint
 from wiw.datasets.questions.survey import HFOV
 from wiw.datasets.worlds import World

@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 from scipy import ndimage, sparse
 from scipy.sparse import csgraph
 
-from wiw.datasets.imagenav import camera_pose
+from wiw.datasets.cameras import camera_pose
 from wiw.datasets.questions.facts import Room, Thing
 from wiw.datasets.worlds import World
 

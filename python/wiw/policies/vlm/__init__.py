@@ -3,6 +3,7 @@
 
 from __future__ import annotations
 
+from collections import Counter
 from collections.abc import Mapping, Sequence
 from copy import deepcopy
 from dataclasses import dataclass, replace
@@ -40,6 +41,8 @@ FALLBACK_SEED, _ANSWER_SEED, _MOVE_SEED, REVISION_SEED = 0x64726177, 0x616E7377,
 FALLBACK_NOTE = "drawn: no answer could be used"
 MAX_PLAN_TOKENS = 1024
 """Most tokens of a plan."""
+ROLES = ("propose", "revise", "answer")
+"""Sorts of questions that may go to different models."""
 MOVES = list(plans.PRIMITIVES.values())
 
 
@@ -91,6 +94,12 @@ class VLM(Policy):
             "target", one view centred on the target.
         rounds: whether more categories than the server lists tokens are asked about in rounds, rather than in one
             question with all of them.
+        shown: whether what a plan is imagined to lead to is shown as a "strip", one image with all of its frames, or as
+            "frames", an image of each.
+        captions: whether a bar above each imagined frame says which action it follows.
+        roles: who is asked the questions of a role, where it is not `model` at `vlm`: {"revise": {"vlm": URL, "model":
+            NAME}}. Roles are "propose" (plans, before anything is imagined), "revise" (which plan, or primitive, to
+            follow) and "answer" (the category, or the answer to a question).
         cache: where answers are kept, so that none is paid for twice: "auto" (`~/.cache/wiw/replies`), a folder, "off".
         prices: YAML file of `model: [read, written]`, dollars per million tokens.
         client: further options of the client, such as `dialect` and `concurrency`.
@@ -128,6 +137,9 @@ class VLM(Policy):
         prices: str | Path | None = None,
         revision_temperature: float = 0.0,
         view_size: int | None = None,
+        shown: Literal["strip", "frames"] = "strip",
+        captions: bool = True,
+        roles: Mapping[str, Mapping[str, Any]] | None = None,
         **client: Any,
     ) -> None:
         if (
@@ -146,11 +158,21 @@ class VLM(Policy):
             raise ArgumentError(
                 f"policy vlm: expected view_size of at least 1, for tasks {', '.join(VLM.tasks)}, got {view_size}"
             )
+        if shown not in ("strip", "frames") or ((shown, captions) != ("strip", True) and not self.shows_front):
+            raise ArgumentError(
+                "policy vlm: expected shown strip or frames, and these or captions=False only for tasks "
+                f"{', '.join(VLM.tasks)}, got shown={shown}, captions={captions}"
+            )
         _require_packages()
         self.prompts = Prompts(prompts)
         table = None if prices is None else Prices.load(prices)
         kept = {"cache": open_reply_cache(cache), "prices": table} if isinstance(vlm, str) else {}
         self.client = connect(vlm, **{**kept, **presets.get_client_options(model), **client})
+        self.roles = {
+            role: connect(own.get("vlm") or vlm, **{**kept, **presets.get_client_options(own["model"]), **client})
+            for role, own in _check_roles(roles or {}, model).items()
+        }
+        self.shown, self.captions = shown, captions
         self.proposals, self.revision, self.temperature, self.tries = proposals, revision, temperature, tries
         self.answer_view, self.rounds = answer_view, rounds
         self.revision_temperature, self.view_size = revision_temperature, view_size
@@ -171,6 +193,9 @@ class VLM(Policy):
             **({} if self.tracker is None else self._describe_recognition(self.tracker)),
             **({"revision_temperature": self.revision_temperature} if self.revision_temperature else {}),
             **({"view_size": self.view_size} if self.view_size else {}),
+            **({} if self.shown == "strip" else {"shown": self.shown}),
+            **({} if self.captions else {"captions": False}),
+            **({"roles": {role: own.describe() for role, own in self.roles.items()}} if self.roles else {}),
         }
 
     def _describe_recognition(self, tracker: Tracker) -> dict[str, Any]:
@@ -178,8 +203,11 @@ class VLM(Policy):
 
     @property
     def spent(self) -> Mapping[str, float]:
-        """Questions and tokens so far; see `wiw.vlm.Client.spent`."""
-        return {"vlm_tokens": 0.0, **self.client.spent}
+        """Questions and tokens so far, of all models; see `wiw.vlm.Client.spent`."""
+        found: Counter[str] = Counter({"vlm_tokens": 0.0})
+        for client in (self.client, *self.roles.values()):
+            found.update(client.spent)
+        return dict(found)
 
     def exchanges(self, key: Key) -> tuple[Exchange, ...]:
         """Return the exchanges of a decision, once."""
@@ -291,7 +319,7 @@ class VLM(Policy):
         the share of each that agrees from its beginning with the plan written by the model ("write").
         """
         rows = list(zip(situations, proposals, rollouts, strict=True))
-        replies = self._ask_each([self._build_scoring_requests(*row) for row in rows])
+        replies = self._ask_each([self._build_scoring_requests(*row) for row in rows], "revise")
         return [
             self._read_scores(situation, proposed, *own) if own else np.ones(1)
             for (situation, proposed, _), own in zip(rows, replies, strict=True)
@@ -318,8 +346,7 @@ class VLM(Policy):
         """Return the question that ranks the plans; none where there is nothing to choose."""
         if situation.goal.choices:
             tracks = self._track_target(situation, proposals, rollouts)
-            strips = [prompt_images.render_plan_strip(*row) for row in zip(proposals, rollouts, tracks, strict=True)]
-            return [self._build_move_request(situation, _caption_strips(proposals, strips))]
+            return [self._build_move_request(situation, self._show_plans(proposals, rollouts, tracks))]
         if self._selects(proposals) and len(proposals) == 1:
             return []
         return [self._build_revision_request(situation, proposals, rollouts)]
@@ -332,9 +359,6 @@ class VLM(Policy):
         self, situation: Situation, proposals: Sequence[Proposal], rollouts: Sequence[Rollout]
     ) -> Request:
         """Ask which of the proposals to follow, or for another plan."""
-        strips = [
-            prompt_images.render_plan_strip(plan, rollout) for plan, rollout in zip(proposals, rollouts, strict=True)
-        ]
         horizon = max(situation.memory.horizon, *(len(plan.actions) for plan in proposals))
         name = "chooser" if self.revision == "select" else "planner_imagined"
         parts: list[Part] = [
@@ -342,7 +366,7 @@ class VLM(Policy):
             "Goal image:",
             self._render_goal(situation.goal),
         ]
-        parts += _caption_strips(proposals, strips)
+        parts += self._show_plans(proposals, rollouts)
         seed = derive_seed(situation.key, REVISION_SEED)
         if self.revision == "select":
             choices = tuple(
@@ -354,6 +378,18 @@ class VLM(Policy):
         return Request(
             (user(*parts),), schema=schema, seed=seed, tries=self.tries, temperature=self.revision_temperature
         )
+
+    def _show_plans(
+        self, proposals: Sequence[Proposal], rollouts: Sequence[Rollout], tracks: Sequence[Track | None] | None = None
+    ) -> list[Part]:
+        """Return each plan in words, and then what it is imagined to lead to."""
+        parts: list[Part] = []
+        rows = zip(proposals, rollouts, tracks or [None] * len(proposals), strict=True)
+        for number, (plan, rollout, track) in enumerate(rows, 1):
+            frames, titles = prompt_images.render_plan_frames(plan, rollout, track)
+            images = prompt_images.arrange_frames(frames, titles if self.captions else None, self.shown == "strip")
+            parts += [f"Plan {number}: {plans.name_actions(plan.actions)}", *images]
+        return parts
 
     def _read_scores(self, situation: Situation, proposals: Sequence[Proposal], reply: Reply) -> NDArray[np.float64]:
         memory: Memory = situation.memory
@@ -401,7 +437,8 @@ class VLM(Policy):
     ) -> Sequence[Answer | TextAnswer | None]:
         """Return the category, by what is really seen of the boxed target and what is imagined of it for each plan."""
         rows = list(zip(situations, proposals, rollouts, strict=True))
-        replies = self._ask_each([self._build_answer_requests(*row) if row[0].goal.choices else [] for row in rows])
+        asked = [self._build_answer_requests(*row) if row[0].goal.choices else [] for row in rows]
+        replies = self._ask_each(asked, "answer")
         return [
             self._build_answer(situation, *own) if situation.goal.choices else None
             for situation, own in zip(situations, replies, strict=True)
@@ -416,7 +453,7 @@ class VLM(Policy):
         if rollouts is not None:
             tracks = self._track_target(situation, proposals, rollouts)
             for number, (rollout, track) in enumerate(zip(rollouts, tracks, strict=True), 1):
-                imagined += _caption_target_strip(number, rollout, track)
+                imagined += self._show_target_frames(number, rollout, track)
         if not real and not imagined:
             return []
         words = OBSERVATION_WORDS if self.answer_view == "observation" else TARGET_WORDS
@@ -426,6 +463,17 @@ class VLM(Policy):
         seed = derive_seed(situation.key, _ANSWER_SEED)
         choices = situation.goal.choices
         return [Request((user(*parts),), choices=choices, rounds=self.rounds, seed=seed, tries=self.tries)]
+
+    def _show_target_frames(self, number: int, rollout: Rollout, track: Track) -> list[Part]:
+        """Return a plan's imagined views of the target, and how many of its imagined frames have lost it."""
+        frames, titles = prompt_images.render_target_frames(rollout, track)
+        if not len(frames):
+            return []
+        imagined = ~rollout.real
+        lost, count = int((imagined & ~track.visible).sum()), int(imagined.sum())
+        said = f"; in {lost} of {count} the thing was lost, and they are left out" if lost else ""
+        images = prompt_images.arrange_frames(frames, titles if self.captions else None, self.shown == "strip")
+        return [f"Imagined views {number}{said}:", *images]
 
     def _show_target(self, observation: Observation) -> list[Part]:
         """Return what is really seen of the target; nothing where it is out of sight."""
@@ -442,7 +490,9 @@ class VLM(Policy):
         memory, choices = situation.memory, situation.goal.choices
         instead = "no choice was preferred" if memory.belief is None else "the last answer was kept"
         if reply is None:
-            lost = Exchange("answer", self.client.model, (), problem=OUT_OF_SIGHT, instead=instead)
+            lost = Exchange(
+                "answer", self.roles.get("answer", self.client).model, (), problem=OUT_OF_SIGHT, instead=instead
+            )
             self._journal.setdefault((situation.key.episode, situation.key.decision), []).append(lost)
         else:
             self._record_exchange(situation.key, "answer", reply, instead)
@@ -468,9 +518,11 @@ class VLM(Policy):
 
     # ------------------------------------------------------------------------------------------------------------------
 
-    def _ask_each(self, requests: Sequence[Sequence[Request]]) -> list[list[Reply]]:
-        """Ask the questions of all episodes at once; return the replies of each."""
-        replies = iter(self.client.ask([request for own in requests for request in own]))
+    def _ask_each(self, requests: Sequence[Sequence[Request]], role: str = "propose") -> list[list[Reply]]:
+        """Ask who has a role the questions of all episodes at once; return the replies of each."""
+        client = self.roles.get(role, self.client)
+        found = client.ask([request for own in requests for request in own])
+        replies = iter([replace(reply, model=client.model) for reply in found])
         return [list(islice(replies, len(own))) for own in requests]
 
     def _render_prompt(self, situation: Situation, name: str, horizon: int, count: int = 1) -> str:
@@ -490,7 +542,7 @@ class VLM(Policy):
         """Record a question's outcome."""
         exchange = Exchange(
             purpose,
-            self.client.model,
+            reply.model,
             tuple({"call": each.call, **each.completion.to_json()} for each in reply.completions),
             {name: value for name, value in self._describe_reading(reply).items() if value},
             "" if reply.problem is None else str(reply.problem),
@@ -505,27 +557,23 @@ def _require_packages() -> None:
         raise DependencyError(f"policy vlm needs {', '.join(missing)}: pip install 'wiw[vlm]'")
 
 
+def _check_roles(roles: Mapping[str, Mapping[str, Any]], model: str | None) -> Mapping[str, Mapping[str, Any]]:
+    """Return the roles as they are.
+
+    Raises:
+        ArgumentError: another role, other options than vlm and model, or a model without a name.
+    """
+    fits = all(role in ROLES and "model" in own and set(own) <= {"vlm", "model"} for role, own in roles.items())
+    if not fits or (roles and model is None):
+        raise ArgumentError(
+            f"policy vlm: expected roles among {', '.join(ROLES)}, each with a model and perhaps another vlm, and the "
+            f"name of the model of all others (model=, --vlm-model), got roles={roles}, model={model}"
+        )
+    return roles
+
+
 def derive_seed(key: Key, number: int) -> int:
     return int(core.fold_key([key.seed, key.episode, key.decision, number]))
-
-
-def _caption_strips(proposals: Sequence[Proposal], strips: Sequence[prompt_images.Image]) -> list[Part]:
-    """Put each plan's description before its strip."""
-    parts: list[Part] = []
-    for number, (plan, strip) in enumerate(zip(proposals, strips, strict=True), 1):
-        parts += [f"Plan {number}: {plans.name_actions(plan.actions)}", strip]
-    return parts
-
-
-def _caption_target_strip(number: int, rollout: Rollout, track: Track) -> list[Part]:
-    """Return a plan's imagined views of the target, and how many of its imagined frames have lost it."""
-    strip = prompt_images.render_target_strip(rollout, track)
-    if strip is None:
-        return []
-    imagined = ~rollout.real
-    lost, count = int((imagined & ~track.visible).sum()), int(imagined.sum())
-    said = f"; in {lost} of {count} the thing was lost, and they are left out" if lost else ""
-    return [f"Imagined views {number}{said}:", strip]
 
 
 def _measure_agreement(plan: NDArray[Any], written: NDArray[Any]) -> float:

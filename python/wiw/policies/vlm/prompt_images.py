@@ -40,10 +40,16 @@ def _choose_interpolation(view: Image, side: int) -> int:
     return cv2.INTER_AREA if side < view.shape[0] else cv2.INTER_CUBIC
 
 
-def render_plan_strip(plan: Proposal, rollout: Rollout, track: Track | None = None) -> Image:
-    """Return front views along a plan, side by side; each under a bar with its action and number, with the target's
-    box.
-    """
+def arrange_frames(frames: Image, titles: Sequence[str] | None, strip: bool) -> list[Image]:
+    """Return frames [N, H, W, 3], each under a bar with its title where there are titles, in one image or in N."""
+    groups = [slice(None)] if strip else [slice(k, k + 1) for k in range(len(frames))]
+    if titles is None:
+        return [np.ascontiguousarray(np.concatenate(list(frames[group]), axis=1)) for group in groups]
+    return [annotate.strip(frames[group], titles[group]) for group in groups]
+
+
+def render_plan_frames(plan: Proposal, rollout: Rollout, track: Track | None = None) -> tuple[Image, list[str]]:
+    """Return front views along a plan, with the target's box, and a title for each: its action and number."""
     fronts, masks = _cut_front_views(rollout, track)
     heads = ["Imagined"] * len(fronts)
     if track is not None and masks is not None:
@@ -51,8 +57,7 @@ def render_plan_strip(plan: Proposal, rollout: Rollout, track: Track | None = No
         heads = [_describe_box(*frame) for frame in zip(boxes, ~track.visible & ~rollout.real, strict=True)]
         fronts = np.stack([_draw_box(*frame) for frame in zip(fronts, boxes, strict=True)])
     words = describe_actions(plan.actions[: len(fronts)])
-    titles = [f"{head} action {k}: {word}" for k, (head, word) in enumerate(zip(heads, words, strict=True), 1)]
-    return annotate.strip(fronts, titles)
+    return fronts, [f"{head} action {k}: {word}" for k, (head, word) in enumerate(zip(heads, words, strict=True), 1)]
 
 
 def _describe_box(box: Box | None, lost: bool) -> str:
@@ -71,23 +76,19 @@ def render_target(observation: Observation) -> Image | None:
     return views.images[0] if len(views.images) else None
 
 
-def render_target_strip(rollout: Rollout, track: Track) -> Image | None:
-    """Return views centred on the target, boxed, of the imagined frames that show it; None where none does.
+def render_target_frames(rollout: Rollout, track: Track) -> tuple[Image, list[str]]:
+    """Return views centred on the target, boxed, of the imagined frames that show it, and a title for each.
 
     Front views, which is all that a perspective model gives, are shown as they are.
     """
     wanted = np.flatnonzero(track.visible & ~rollout.real)
     if not len(wanted):
-        return None
+        return rollout.frames[:0], []
     if rollout.view == "panorama":
         images = cut_target_views(rollout.frames[wanted], track.masks[wanted], (VIEW, VIEW)).images
     else:
         images = np.stack([_draw_box(rollout.frames[k], track.boxes[k]) for k in wanted])
-    return annotate.strip(images, _number_views(len(images))) if len(images) else None
-
-
-def _number_views(count: int) -> Sequence[str]:
-    return [f"Imagined view {k + 1}" for k in range(count)]
+    return images, [f"Imagined view {k + 1}" for k in range(len(images))]
 
 
 def _cut_front_views(rollout: Rollout, track: Track | None) -> tuple[Image, NDArray[np.bool_] | None]:

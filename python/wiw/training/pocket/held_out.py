@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 
 from wiw import metrics, scenes
 from wiw._core import core
-from wiw.datasets.imagenav import camera_pose
+from wiw.datasets.cameras import camera_pose
 from wiw.datasets.worlds import World, world
 from wiw.errors import ArgumentError
 from wiw.training.navigation_rules import NavigationRules

@@ -215,7 +215,7 @@ class QuestionVLM(VLM):
     ) -> list[NDArray[np.float64]]:
         """Return the probability of each plan ("select"), or its agreement with that of the command that is written."""
         rows = list(zip(situations, proposals, rollouts, strict=True))
-        replies = self._ask_each([self._build_scoring_requests(*row) for row in rows])
+        replies = self._ask_each([self._build_scoring_requests(*row) for row in rows], "revise")
         written = [self._read_revision(situation, own) for situation, own in zip(situations, replies, strict=True)]
         planned = self._plan_commands(list(zip(situations, written, strict=True)))
         return [

@@ -1,0 +1,51 @@
+# SPDX-License-Identifier: Apache-2.0
+"""`wiw study NAME` and `wiw study FILE.yaml`."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Annotated
+
+from tyro.conf import Positional, UseAppendAction, arg
+
+
+def run_study(
+    study: Positional[Annotated[str, arg(metavar="NAME|FILE.yaml")]],
+    /,
+    *,
+    out: Annotated[Path | None, arg(metavar="DIR")] = None,
+    set: Annotated[tuple[str, ...], UseAppendAction, arg(metavar="NAME=VALUE")] = (),
+    small: bool = False,
+    workers: Annotated[int, arg(metavar="N")] = 1,
+) -> int:
+    """Run a study: the runs that its file lists, with its figures and tables on one page.
+
+    $ wiw study front-vs-panorama --small
+    $ wiw study vlm --set server=http://localhost:8000/v1 --set model=qwen2.5-vl-72b-awq --workers 2
+    $ wiw study models --set arms=none,copy,warp,mine=my_model.py:MyModel,oracle --set episodes=100
+    $ wiw study my.yaml --set episodes=100
+
+    Writes study.html, study.json, study.yaml (the file with its variables filled in) and an SVG of each figure. Each
+    run is a folder beside them, which `wiw report` and `wiw compare` know as any other. After Ctrl-C the same command
+    goes on; a finished study only draws its page again. `wiw list studies` names the shipped ones, `wiw study --help`
+    shows how to write one.
+
+    Args:
+        study: Name, or path of a YAML file.
+        out: Folder; runs/study-NAME if not given.
+        set: Value of one of the study's variables, as YAML; may be given again.
+        small: Whether to take the study's small values, for a look at it.
+        workers: Processes; results do not depend on it.
+    """
+    from wiw.cli.stop import announce_resume
+    from wiw.studies.study import study as run
+    from wiw.studies.study_file import parse_variables
+
+    with announce_resume():
+        found = run(study, out=out, variables=parse_variables(set), small=small, workers=workers)
+    found.summary()
+    for path in found.save():
+        print(path)
+    for reason in found.invalid:
+        print(f"INVALID RUN, do not report: {reason}")
+    return 1 if found.invalid else 0

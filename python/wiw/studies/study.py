@@ -1,0 +1,161 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Run what a study's file lists, and put its tables and figures on one page (`wiw.studies.study_file`)."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Mapping
+from dataclasses import asdict, dataclass, replace
+from pathlib import Path
+from typing import Any
+
+import yaml
+
+from wiw.analysis.costs import costs
+from wiw.analysis.quality import QualityTable
+from wiw.analysis.statistics import Difference, adjust_p_values
+from wiw.analysis.statistics import compare as compare_arms
+from wiw.analysis.summary import select_metrics, split_outcomes
+from wiw.errors import ArgumentError
+from wiw.files import atomic_file
+from wiw.report.tables import SummaryTable, print_summary
+from wiw.runs.rows import to_json
+from wiw.studies.evaluate import run_arms
+from wiw.studies.quality import quality
+from wiw.studies.run_log import RunLog
+from wiw.studies.study_file import StudyPlan, StudyRun, load_study
+
+FILE = "study.yaml"
+"""In a study's folder: the file with its variables filled in."""
+
+
+@dataclass(frozen=True)
+class StudyPart:
+    """What came of one run of a study."""
+
+    run: StudyRun
+    log: RunLog
+    numbers: SummaryTable
+    differences: tuple[Difference, ...]
+    """Of the pairs that the study compares, Holm-adjusted over them."""
+    rollouts: Mapping[str, float]
+    """Imagined futures per episode, by arm."""
+    quality: QualityTable | None = None
+
+    def as_dict(self) -> dict[str, Any]:
+        """Return the numbers as plain values."""
+        return {
+            "run": self.run.name,
+            "arms": [{**line, "rollouts": self.rollouts[line["arm"]]} for line in self.log.table()],
+            "differences": [asdict(each) for each in self.differences],
+            **({} if self.quality is None else {"quality": self.quality.as_dict()}),
+        }
+
+
+@dataclass(frozen=True)
+class Study:
+    """The result of `wiw.study`."""
+
+    plan: StudyPlan
+    parts: tuple[StudyPart, ...]
+    out: Path
+    """Folder of the study, which `save` writes into."""
+
+    @property
+    def invalid(self) -> tuple[str, ...]:
+        """Reasons why runs must not be reported; empty for a valid study."""
+        return tuple(f"{part.run.name}: {reason}" for part in self.parts for reason in part.numbers.invalid)
+
+    def summary(self) -> None:
+        """Print the tables of all runs."""
+        from wiw.report.study_page import group_pairs
+
+        for part in self.parts:
+            heading = part.run.name if len(self.parts) > 1 else ""
+            print_summary(part.numbers, heading, group_pairs(part.differences))
+
+    def to_json(self) -> str:
+        """Return the numbers as JSON."""
+        values = {"title": self.plan.title, "variables": self.plan.variables, "runs": [p.as_dict() for p in self.parts]}
+        return json.dumps(json.loads(to_json(values)), indent=2)
+
+    def save(self) -> list[Path]:
+        """Write study.html, study.json and an SVG file of each figure into `out`, and return their paths."""
+        from wiw.report.study_page import write_study
+
+        return write_study(self.plan, self.parts, self.to_json(), self.out)
+
+
+def study(
+    name: str | Path,
+    *,
+    out: str | Path | None = None,
+    variables: Mapping[str, Any] | None = None,
+    small: bool = False,
+    workers: int = 1,
+    progress: bool = True,
+) -> Study:
+    """Run a study: the runs that its file lists, one after another, or what is missing of them.
+
+        found = wiw.study("front-vs-panorama", small=True)
+        found.summary()
+        found.save()                       # study.html, study.json and figures
+
+    A second call goes on where the first one stopped. Rollouts of models that are cacheable and answers of language
+    models are kept, so that no run asks for what another has.
+
+    Args:
+        name: of a shipped study (`wiw list studies`), or the path of a YAML file.
+        out: folder; runs/study-NAME if not given.
+        variables: values in place of the file's.
+        small: whether to take the file's small values.
+        workers: processes; results do not depend on it.
+        progress: whether to show progress bars.
+
+    Raises:
+        ArgumentError: no such study, or one that cannot be run; says where in the file.
+        StoreError: the folder holds runs of other settings.
+    """
+    plan = load_study(name, variables, small)
+    folder = Path(out) if out is not None else Path("runs") / f"study-{Path(name).stem}"
+    for run in plan.runs:
+        _require(run)
+    folder.mkdir(parents=True, exist_ok=True)
+    with atomic_file(folder / FILE) as draft:
+        draft.write_text(yaml.safe_dump(dict(plan.content), sort_keys=False, allow_unicode=True), encoding="utf-8")
+    return Study(plan, tuple(_run(run, folder, workers, progress) for run in plan.runs), folder)
+
+
+def _require(run: StudyRun) -> None:
+    """Check that a run can be begun, before any of them takes time.
+
+    Raises:
+        Error: its task or its agents cannot be.
+    """
+    task = run.task.build()
+    count = task.default_episodes if run.settings.episodes is None else run.settings.episodes
+    for arm, agent in run.agents.items():
+        agent.describe()
+        agent.require(task, count)
+        if run.quality is not None and not agent.is_named:
+            raise ArgumentError(f"study: {run.name}: arm '{arm}' is no name; quality is measured of stored runs")
+
+
+def _run(run: StudyRun, folder: Path, workers: int, progress: bool) -> StudyPart:
+    """Run one run, or what is left of it, and measure what the study asks of it."""
+    settings = replace(run.settings, out=folder / run.name, resume=True, workers=workers, progress=progress)
+    log = run_arms(run.task, run.agents, config=settings)
+    imagined = {line.arm: line.calls.get("rows", 0.0) / line.episodes for line in costs(log) if line.episodes}
+    table = None if run.quality is None else quality(log, **run.quality).table
+    everyone = {arm: imagined.get(arm, 0.0) for arm in log.arms}
+    return StudyPart(run, log, log.numbers(), _compare(run, log), everyone, table)
+
+
+def _compare(run: StudyRun, log: RunLog) -> tuple[Difference, ...]:
+    """Return the differences of the study's pairs; p-values are adjusted for all of them."""
+    done, _ = split_outcomes(log.arms, log.store.outcomes())
+    seed = log.store.config["seed"]
+    found = [
+        compare_arms(arm, base, done, metric, seed) for arm, base in run.compare for metric in select_metrics(done)
+    ]
+    return adjust_p_values([each for each in found if each is not None])

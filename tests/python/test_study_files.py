@@ -1,0 +1,187 @@
+# SPDX-License-Identifier: Apache-2.0
+"""`wiw study`: YAML files that list runs, what is compared and what is plotted."""
+
+from __future__ import annotations
+
+import json
+import re
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+import wiw
+from wiw.cli.app import main
+from wiw.errors import ArgumentError, FileError, StoreError
+from wiw.runs.config import RunConfig
+from wiw.studies.study_file import list_studies, load_study, parse_variables
+
+OWN = """
+title: Is <it> worth it?
+about: one line
+text: Bear & mind.
+variables: {scenes: SCENES, model: warp, episodes: 2, options: {size: [64, 128]}, extra: null}
+small: {episodes: 1}
+settings: {seed: 3, keep_images: 0}
+runs:
+  here:
+    task: imagenav
+    task_options: {scenes: "{scenes}", decisions: 1, goal_instances: 1}
+    settings: {episodes: "{episodes}"}
+    agent: {policy: heuristic, candidates: 2, model: "{model}", reviser: matcher}
+    arms:
+      none: {model: none, reviser: null}
+      front: {model_options: {view: perspective, size: [48, 48]}}
+      around: {model_options: {view: panorama, size: [48, 96]}, with: {model_options: "{options}"}}
+      left-out: {when: "{extra}", model: "{extra}"}
+    compare: [[around, front], [left-out, front]]
+    plots: [success, rollouts]
+"""
+
+
+@pytest.fixture
+def own(two_rooms: str, tmp_path: Path) -> Path:
+    path = tmp_path / "own.yaml"
+    path.write_text(OWN.replace("SCENES", two_rooms))
+    return path
+
+
+def test_a_study_runs_resumes_and_draws_its_page(own: Path, tmp_path: Path, capsys: Any) -> None:
+    out = tmp_path / "out"
+    command = ["study", str(own), "--out", str(out), "--set", "episodes=2"]
+    assert main(command) == 0
+    said = capsys.readouterr().out
+    assert "Compared, paired by episode" in said and str(out / "study.html") in said
+    written = {path.name for path in out.iterdir()}
+    assert written >= {"study.html", "study.json", "study.yaml", "here", "here-success-by-arm.svg"}
+    page = (out / "study.html").read_text()
+    assert "Is &lt;it&gt; worth it?" in page and "Bear &amp; mind." in page and page.count("<svg") == 2
+    assert "around - front" in page and "left-out - front" not in page
+    assert not re.search(r"(src|href)=.https?:", page)
+    numbers = json.loads((out / "study.json").read_text())["runs"][0]
+    assert [line["arm"] for line in numbers["arms"]] == ["none", "front", "around"]
+    assert {line["n"] for line in numbers["arms"]} == {2} and numbers["arms"][0]["rollouts"] == 0
+    assert numbers["arms"][1]["rollouts"] == numbers["arms"][2]["rollouts"] > 0  # equal numbers of futures
+    assert {(each["arm"], each["base"]) for each in numbers["differences"]} == {("around", "front")}
+    log = wiw.load_run(out / "here")
+    ended = [(row["arm"], row["episode"], row["seconds"]) for row in log.episodes]
+    assert wiw.study(own, out=out, progress=False).save()  # nothing is run again
+    assert [(row["arm"], row["episode"], row["seconds"]) for row in wiw.load_run(out / "here").episodes] == ended
+    with pytest.raises(StoreError, match="episodes"):
+        wiw.study(own, out=out, variables={"episodes": 1}, progress=False)
+
+
+def test_variables_are_filled_in_and_arms_are_merged(own: Path) -> None:
+    (run,) = load_study(own).runs
+    assert list(run.agents) == ["none", "front", "around"] and run.agents["none"].model is None
+    assert run.agents["around"].model_options == {"view": "panorama", "size": [64, 128]}
+    assert run.agents["front"].model == "warp" and run.compare == (("around", "front"),)
+    assert run.settings == RunConfig(seed=3, keep_images=0, episodes=2) and run.task.options["seed"] == 3
+    assert load_study(own, small=True).runs[0].settings.episodes == 1
+    assert load_study(own, {"episodes": 7}, small=True).runs[0].settings.episodes == 7
+    with_more = load_study(own, {"extra": "copy", "model": "oracle"}).runs[0]
+    assert with_more.agents["left-out"].model == "copy" and with_more.agents["front"].model == "oracle"
+    assert len(with_more.compare) == 2
+    assert parse_variables(["a=1", "b=[1, 2]", "c=x", "d="]) == {"a": 1, "b": [1, 2], "c": "x", "d": None}
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "said"),
+    [
+        ("title:", "titel:", "unknown name 'titel'.*Did you mean title"),
+        (
+            '"{model}", reviser',
+            '"{modle}", reviser',
+            "runs: here: agent: model: unknown name 'modle'.*Did you mean model",
+        ),
+        ("small: {episodes", "small: {episode", "small: unknown name 'episode'; there are scenes, model, episodes"),
+        ("policy: heuristic, ", "", "arms: none: expected a policy, here or in `agent`, got none"),
+        ("candidates: 2", "candidate: 2", "arms: none: unknown name 'candidate'.*Did you mean candidates"),
+        ("[around, front], ", "[round, front], ", "compare: unknown name 'round'.*Did you mean around"),
+        ("[[around, front], [left-out, front]]", "[around, front]", "compare: expected pairs of arms"),
+        ("[success, rollouts]", "[succes]", "plots: unknown name 'succes'.*Did you mean success"),
+        ("keep_images: 0", "keep_image: 0", "settings: unknown name 'keep_image'.*Did you mean keep_images"),
+        ("seed: 3", "out: there", "settings: unknown name 'out'"),
+        ("{model: none, reviser: null}", "{model: copy}", "reports take the arm 'none' for the reference"),
+        ("      front:", "      fr/ont:", "arms"),
+        ("runs:\n  here:", "runs: {}\nsmal:\n  here:", "unknown name 'smal'"),
+    ],
+)
+def test_what_a_study_cannot_say_is_refused_with_its_place(own: Path, old: str, new: str, said: str) -> None:
+    text = own.read_text()
+    assert old in text
+    own.write_text(text.replace(old, new, 1))
+    with pytest.raises(ArgumentError, match=said):
+        load_study(own)
+
+
+def test_studies_are_listed_taught_and_looked_up(capsys: Any, tmp_path: Path) -> None:
+    assert {"front-vs-panorama", "models", "vlm"} <= set(list_studies())
+    assert main(["list", "studies"]) == 0
+    listed = capsys.readouterr().out
+    assert all(name in listed for name in ("data-scaling", "front-vs-panorama", "models", "vlm"))
+    with pytest.raises(SystemExit):
+        main(["study"])
+    taught = capsys.readouterr().out
+    example = taught[taught.index("  title:") : taught.index("Arms take")]
+    (tmp_path / "example.yaml").write_text(example)
+    assert [*load_study(tmp_path / "example.yaml").runs[0].agents] == [
+        "none",
+        "short",
+        "long",
+    ]  # the help can be copied
+    assert main(["study", "modles"]) == 2 and "Did you mean models?" in capsys.readouterr().err
+    assert main(["study", "vlm", "--set", "servr=x"]) == 2 and "Did you mean server?" in capsys.readouterr().err
+    assert main(["study", "vlm", "--set", "server"]) == 2 and "expected NAME=VALUE" in capsys.readouterr().err
+    with pytest.raises(FileError, match="expected a study"):
+        load_study(tmp_path / "nowhere.yaml")
+
+
+def test_shipped_studies_are_what_they_say() -> None:
+    (front,) = load_study("front-vs-panorama").runs
+    one, other = (front.agents[name].model_options for name in ("front", "panorama"))
+    pixels = [options["size"][0] * options["size"][1] for options in (one, other)]
+    assert abs(pixels[0] / pixels[1] - 1) < 0.01 and (one["view"], other["view"]) == ("perspective", "panorama")
+    assert front.agents["front"].numbers == front.agents["panorama"].numbers and front.compare == (
+        ("panorama", "front"),
+    )
+    (models,) = load_study("models", {"arms": "none,copy,big=warp?size=[64,128]"}).runs
+    assert list(models.agents) == ["none", "copy", "big"] and models.settings.keep_images == "all"
+    (vlm,) = load_study("vlm").runs
+    assert "other-revises" not in vlm.agents and "imported" not in vlm.agents and "base" in vlm.agents
+    (vlm,) = load_study("vlm", {"model": "a", "other": "b", "other_server": "http://b", "imported": "prompts"}).runs
+    assert vlm.agents["other-revises"].policy_options["vlm"] == {
+        "vlm": "http://localhost:8000/v1", "model": "a", "roles": {"revise": {"vlm": "http://b", "model": "b"}}
+    }  # fmt: skip
+    assert vlm.agents["imported"].policy_options["vlm"]["prompts"] == "prompts"
+
+
+@pytest.mark.nightly
+def test_the_studies_of_models_and_of_views_run_in_small(tmp_path: Path, two_rooms: str) -> None:
+    tiny = {"scenes": two_rooms, "episodes": 2, "per_scene": 2, "tier": "any"}
+    arms = {"arms": "none,copy,warp?size=[64,128],oracle?size=[64,128]", "frames": 6}
+    found = wiw.study("models", out=tmp_path / "m", small=True, variables={**tiny, **arms}, progress=False)
+    assert found.save() and "controllability" in (tmp_path / "m/study.html").read_text()
+    sizes = {"front_size": [48, 48], "panorama_size": [34, 68]}
+    found = wiw.study("front-vs-panorama", out=tmp_path / "f", small=True, variables={**tiny, **sizes}, progress=False)
+    assert [line.name for line in found.parts[0].numbers.arms] == ["none", "front", "panorama"]
+
+
+@pytest.mark.nightly
+def test_the_study_of_language_models_asks_each_server_for_its_part(tmp_path: Path) -> None:
+    pytest.importorskip("openai")
+    from wiw.serving.vlm_server import VlmServer
+    from wiw.vlm.mock import MockClient
+
+    with VlmServer(MockClient(model="a")) as first, VlmServer(MockClient(model="b")) as second:
+        names = {"server": first.url, "other_server": second.url, "model": "a", "other": "b", "task": "ar"}
+        found = wiw.study("vlm", out=tmp_path, small=True, variables={**names, "world_model": "copy"}, progress=False)
+    (part,) = found.parts
+    assert len(part.numbers.arms) == 9 and not found.invalid
+    asked: dict[str, set[str]] = {}
+    for row in part.log.decisions:
+        for exchange in row["exchanges"]:
+            asked.setdefault(row["arm"], set()).add(f"{exchange['purpose'].partition('/')[0]} {exchange['model']}")
+    assert "answer b" in asked["other-answers"] and "answer a" in asked["other-revises"]
+    assert "move b" in asked["other-revises"] and "propose b" in asked["other-proposes"]
+    assert not any(each.endswith(" b") for each in asked["base"])
