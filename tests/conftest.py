@@ -49,6 +49,12 @@ BOXES = {  # name: material, least corner, greatest corner; metres, Y up
 }
 
 
+@pytest.fixture(autouse=True)
+def no_salt(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Leave keys plain where a test gives no salt: two runs draw the same, and test agents know an episode again."""
+    monkeypatch.setattr("wiw.loop.keys.draw_salt", lambda: "")
+
+
 @pytest.hookimpl(wrapper=True)
 def pytest_collection() -> Generator[None, object, object]:
     """Leave what collection makes out of garbage collections: modules and tests live until the end."""

@@ -46,6 +46,7 @@ PYTHON_ROWS = [
     FACES,
     {"datasets", "mapping", "metrics", "perception", "tabletop", "vlm", "wire"},
     {"envs", "judging", "policies", "scorers", "world_models"},
+    {"isolation"},
     {"tasks", "loop", "training"},
     {"experiments"},
     {"runs"},

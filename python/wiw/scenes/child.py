@@ -65,13 +65,18 @@ def limit_time(seconds: float) -> None:
     resource.setrlimit(resource.RLIMIT_CORE, (0, resource.getrlimit(resource.RLIMIT_CORE)[1]))
 
 
-def limit_memory() -> int:
-    """Let this process take three quarters of the machine's or the container's memory; return that in bytes."""
+def find_memory_limit() -> int:
+    """Return three quarters of the machine's or the container's memory in bytes."""
     most = os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES")
     for file in _CGROUPS:
         with suppress(OSError, ValueError):  # "max": no limit
             most = min(most, int(Path(file).read_text()))
-    most = most * 3 // 4
+    return most * 3 // 4
+
+
+def limit_memory() -> int:
+    """Let this process take three quarters of the machine's or the container's memory; return that in bytes."""
+    most = find_memory_limit()
     _, hard = resource.getrlimit(resource.RLIMIT_DATA)
     most = most if hard == resource.RLIM_INFINITY else min(most, hard)
     resource.setrlimit(resource.RLIMIT_DATA, (most, hard))

@@ -29,7 +29,7 @@ class Oracle(WorldModel):
         ArgumentError: no size.
     """
 
-    accepts = accepts(control="action", view="panorama", needs=("simulator",), causal=True, best_batch=64)
+    accepts = accepts(control="action", view="panorama", needs=("simulator",), causal=True, best_batch=64, seeded=False)
 
     def __init__(self, size: Sequence[int] | None = None) -> None:
         if size is None:
@@ -65,7 +65,9 @@ class Oracle(WorldModel):
 class ArmOracle(Oracle):
     """Send a fork of the physics to each pose of a plan, one after another, and return what it truly sees."""
 
-    accepts = accepts(control="action", space=GRIPPER_POSES, view="perspective", needs=("simulator",), best_batch=64)
+    accepts = accepts(
+        "action", space=GRIPPER_POSES, view="perspective", needs=("simulator",), best_batch=64, seeded=False
+    )
 
     def rollout(
         self, observations: Conditioning, controls: Sequence[Control], seeds: NDArray[np.uint64]
