@@ -49,10 +49,12 @@ BOXES = {  # name: material, least corner, greatest corner; metres, Y up
 }
 
 
-@pytest.fixture(autouse=True)
-def no_salt(monkeypatch: pytest.MonkeyPatch) -> None:
+@pytest.fixture(autouse=True, scope="session")
+def no_salt() -> Iterator[None]:
     """Leave keys plain where a test gives no salt: two runs draw the same, and test agents know an episode again."""
-    monkeypatch.setattr("wiw.loop.keys.draw_salt", lambda: "")
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr("wiw.loop.keys.draw_salt", lambda: "")
+        yield
 
 
 @pytest.hookimpl(wrapper=True)

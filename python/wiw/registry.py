@@ -46,6 +46,8 @@ class Registry:
     door: str = ""
     """`module:function` that returns what stands for a part of somebody else's, given its name, so that its code is
     imported and run in a process of its own; empty where such parts are run in this one."""
+    prefix: str = ""
+    """What names begin with that are to go through the door; empty where those of all parts of somebody else's do."""
 
     def names(self) -> list[str]:
         """Return all registered names, built-in ones first."""
@@ -68,8 +70,8 @@ class Registry:
             RegistryError: unknown name; missing file, module or attribute; an exception while it was imported (the
                 cause); a class of another kind.
         """
-        if self.door and self.is_foreign(name):
-            return _attribute(self.door)(name)
+        if self.door and (name.startswith(self.prefix) if self.prefix else self.is_foreign(name)):
+            return _attribute(self.door)(name.removeprefix(self.prefix))
         return self.find_here(name)
 
     def is_foreign(self, name: str) -> bool:
@@ -257,6 +259,8 @@ WORLD_MODELS = Registry(
     "wiw.world_models.base:WorldModel",
     door="wiw.isolation.models:find_isolated_model",
 )
+ISOLATED = "isolated:"
+"""What a policy's name begins with that is to run in a process of its own."""
 FUNCTION = "wiw.world_models.function:Function"
 """What makes a world model of a function."""
 POLICIES = Registry(
@@ -277,6 +281,8 @@ POLICIES = Registry(
         "explorer-oracle-tour": "wiw.experiments.privileged_explorers:OracleTourExplorer",
     },
     "wiw.policies.base:Policy",
+    door="wiw.isolation.policies:find_isolated_policy",
+    prefix=ISOLATED,
 )
 TASKS = Registry(
     "task",

@@ -95,7 +95,7 @@ def test_seeds_invert_to_episode_decision_and_candidate_only_without_a_salt(tmp_
 def test_a_key_and_the_command_line_do_not_tell_the_episode(two_rooms, tmp_path, monkeypatch, capsys, salt) -> None:
     monkeypatch.setattr("wiw.loop.keys.draw_salt", draw_salt)  # that of conftest draws none
     name = f"{HERE / 'cheats.py'}:EpisodeRegenerator"
-    flags = ["--scenes", two_rooms, "--seed", "3", "--episodes", "2", "--policy", name, "--task-option", "decisions=6"]
+    flags = ["--scenes", two_rooms, "--seed", "3", "--episodes", "2", "--policy", name]
     command = [
         "run",
         "imagenav",
@@ -139,7 +139,7 @@ def test_a_run_keeps_its_salt_and_every_later_command_has_it(tmp_path, monkeypat
     one, other = (run(tmp_path / name) for name in ("one", "other"))
     assert one.store.salt != other.store.salt
     assert one.store.episodes() == other.store.episodes()  # they are chosen by the seed alone
-    assert compare(one, other).paired is not None
+    assert compare(one, other).differences
     assert wiw.verify(tmp_path / "one", 5).same and wiw.verify(tmp_path / "other", 5).same
     facts = [[row["metrics"] for row in log.episodes] for log in (one, other)]
     assert facts[0] != facts[1]

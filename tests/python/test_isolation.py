@@ -26,6 +26,8 @@ from wiw.isolation.failures import EndedError, ExitError, LateError, RaisedError
 from wiw.isolation.models import IsolatedModel
 from wiw.loop import attempts
 from wiw.loop.attempts import Attempted, make_model
+from wiw.runs.recipes import AgentRecipe, TaskRecipe
+from wiw.studies.evaluate import evaluate
 from wiw.types import Conditioning, Control
 
 BAD = f"{Path(__file__).with_name('bad_models.py')}:Bad"
@@ -191,3 +193,67 @@ def test_construction_and_import_fail_by_kind(tmp_path) -> None:
     assert pickle.loads(pickle.dumps(made)).describe() == made.describe()
     with pytest.raises(ArgumentError, match="only the oracle is handed"):
         make_model(write(head.replace("frames=3", "needs=('simulator',)")))
+
+
+POLICY = """
+import os
+from collections import Counter
+
+import numpy as np
+
+import wiw
+from wiw.action import FORWARD, TURN_LEFT
+from wiw.types import Proposal
+
+
+class Own(wiw.Policy):
+    def __init__(self, fatal: int = -1) -> None:
+        self.fatal = fatal
+
+    def begin(self, goal, key):
+        return Counter()
+
+    def observe(self, situations):
+        for each in situations:
+            each.memory["looks"] += 1
+
+    def propose(self, situations, candidates, horizon):
+        if any(each.key.episode == self.fatal for each in situations):
+            os._exit(3)
+        return [[self._plan(each, number) for number in range(candidates)] for each in situations]
+
+    def _plan(self, situation, number):
+        draws = np.random.default_rng([situation.key.episode, situation.key.decision, number]).random(3)
+        actions = np.where(draws < 0.8, FORWARD, TURN_LEFT)
+        return Proposal(actions, float(draws[0]), f"look {situation.memory['looks']}, {len(situation.executed)} done")
+
+    def score(self, situations, proposals, rollouts):
+        return [np.array([plan.prior for plan in plans]) for plans in proposals]
+
+    def describe(self):
+        return {"policy": "Own"}
+"""
+
+
+def test_a_policy_decides_in_its_process_as_in_ours_and_cannot_take_the_run_with_it(tmp_path) -> None:
+    (tmp_path / "own.py").write_text(POLICY)
+    name, task = f"{tmp_path / 'own.py'}:Own", TaskRecipe(f"{Path(__file__).with_name('fakes.py')}:line_task")
+
+    def run(policy, **options):
+        recipe = AgentRecipe(policy, policy_options={policy: options})
+        return evaluate(task, recipe, 4, out=tmp_path / f"run{len(list(tmp_path.iterdir()))}", progress=False, live=2)
+
+    def read(log):
+        said = ("actions", "proposals", "scores", "chosen", "note")
+        return [{name: row[name] for name in said if name in row} for row in log.store.decisions()]
+
+    here, there = run(name), run(f"isolated:{name}")
+    assert read(here) == read(there) and len(read(here)) > 8
+    assert [row["metrics"] for row in here.episodes] == [row["metrics"] for row in there.episodes]
+    assert there.store.config["arms"][0]["agent"]["policy"] == f"isolated:{name}"  # so says the manifest
+    assert wiw.verify(there.path, 4).same
+    log = run(f"isolated:{name}", fatal=2)
+    assert [(row["episode"], row["status"]) for row in log.episodes if row["status"] != "done"] == [(2, "error")]
+    assert "its process ended with exit code 3" in log.episodes[2]["error"]
+    with pytest.raises(RegistryError, match="expected a policy of your own"):
+        wiw.policy("isolated:matcher")

@@ -36,6 +36,7 @@ class Host:
         thing: class, factory or object that was loaded.
         make: makes an instance of it.
         made: that instance.
+        memories: of its live episodes, by number, and their `count`, where it is a policy.
         answer: memory for arrays of the answer, uint8 [bytes], during a call that asks for it.
     """
 
@@ -43,6 +44,8 @@ class Host:
         self.thing: Any = None
         self.make: Any = None
         self.made: Any = None
+        self.memories: dict[int, Any] = {}
+        self.count = 0
         self.answer: NDArray[np.uint8] = np.empty(0, np.uint8)
 
 

@@ -7,7 +7,6 @@ instance of it passes each rollout on to the instance in its process. Nothing of
 
 from __future__ import annotations
 
-import inspect
 import json
 import math
 from collections import Counter
@@ -15,23 +14,23 @@ from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from contextvars import ContextVar
 from functools import lru_cache, partial
-from pathlib import Path
-from typing import Any, ClassVar
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from wiw.errors import ArgumentError, ConstructionError, InfrastructureError, RegistryError
+from wiw.errors import ArgumentError, ConstructionError, RegistryError
 from wiw.isolation.child import Host
 from wiw.isolation.failures import EndedError, ExitError, LateError, RaisedError
 from wiw.isolation.process import ChildProcess
+from wiw.isolation.source import Isolated, Source, build_signature, read_file_state, require_task, tell_class
 from wiw.json_text import parse_json
 from wiw.registry import WORLD_MODELS
 from wiw.types import Conditioning, Control
 from wiw.world_models.base import Accepts, Requirements, WorldModel, answer_deadline, require_frames, seconds_left
 from wiw.world_models.remote.declaration import declaration, parse_declaration
 
-DOOR = ("isolate", "memory_gb")
+DOOR = {"isolate": (True, "bool"), "memory_gb": (None, "float | None")}
 """Options of every model of one's own, which its constructor does not see."""
 RESTARTS = 2
 """Calls in a row that raise, after which the process is started anew."""
@@ -56,21 +55,19 @@ def find_isolated_model(name: str) -> type[IsolatedModel]:
     Raises:
         RegistryError: it cannot be imported, which is tried in a process of its own.
     """
-    path = Path(name.rpartition(":")[0]).expanduser()
-    state = path.stat() if path.suffix == ".py" and path.is_file() else None
-    return _make_class(name, str(path.resolve()), None if state is None else (state.st_mtime_ns, state.st_size))
+    return _make_class(name, read_file_state(name))
 
 
 @lru_cache(64)
-def _make_class(name: str, path: str, state: tuple[int, int] | None) -> type[IsolatedModel]:
+def _make_class(name: str, state: tuple[str, int, int] | None) -> type[IsolatedModel]:
     """Return the class of a name; an edited file has another one."""
-    source = ModelSource(name)
+    source = Source("world model", name, load_model)
     told = source.told
     attributes: dict[str, Any] = {
         "source": source,
         "version": told["version"],
         "requires": Requirements(packages=tuple(told["packages"]), extra=told["extra"], weights=told["weights"]),
-        "__signature__": _build_signature(told["parameters"]),
+        "__signature__": build_signature(told["parameters"], DOOR),
         "__module__": told["module"],
         "__doc__": told["doc"],
     }
@@ -79,48 +76,7 @@ def _make_class(name: str, path: str, state: tuple[int, int] | None) -> type[Iso
     return type(told["name"], (IsolatedModel,), attributes)
 
 
-class ModelSource:
-    """The code of a model, in a process that nobody has made the model in so far."""
-
-    def __init__(self, name: str) -> None:
-        self.name = name
-        self._idle: ChildProcess | None = None
-        self.told = self.load(process := ChildProcess())
-        self._idle = process
-
-    def ask(self, function: Callable[..., Any], *arguments: Any) -> Any:
-        """Call a function on the imported class; see `ChildProcess.call`."""
-        if self._idle is None or not self._idle.alive:
-            self._idle = ChildProcess()
-            self.load(self._idle)
-        return self._idle.call(function, *arguments)[0]
-
-    def take_process(self, memory_gb: float | None) -> ChildProcess:
-        """Return a process that has imported the code; nobody else has it."""
-        if memory_gb is None and self._idle is not None and self._idle.alive:
-            process, self._idle = self._idle, None
-            return process
-        process = ChildProcess(memory_gb)
-        self.load(process)
-        return process
-
-    def load(self, process: ChildProcess) -> dict[str, Any]:
-        """Import the code in a process; return what it says of itself.
-
-        Raises:
-            RegistryError: it cannot be imported.
-            InfrastructureError: it is not what it was when it was imported first.
-        """
-        try:
-            told: dict[str, Any] = process.call(load_model, self.name)[0]
-        except (EndedError, ExitError) as error:
-            raise RegistryError(f"world model '{self.name}' cannot be loaded: {error}") from None
-        if told != getattr(self, "told", told):
-            raise InfrastructureError(f"world model '{self.name}' has changed since it was loaded; begin a new run")
-        return told
-
-
-class IsolatedModel(WorldModel):
+class IsolatedModel(WorldModel, Isolated):
     """Stands for a world model in a process of its own.
 
     Args:
@@ -133,8 +89,6 @@ class IsolatedModel(WorldModel):
             it raised.
         ArgumentError: the model asks for the simulator.
     """
-
-    source: ClassVar[ModelSource]
 
     def __new__(cls, isolate: bool = True, memory_gb: float | None = None, **options: Any) -> Any:
         """Return an instance of this class, or the model itself where it is not isolated."""
@@ -257,43 +211,6 @@ class _Declared:
         return self._declared if model is None else model._accepts
 
 
-class _Hidden:
-    """A default value that the class keeps to itself."""
-
-    def __init__(self, text: str) -> None:
-        self._text = text
-
-    def __repr__(self) -> str:
-        return self._text
-
-
-def _build_signature(parameters: Sequence[Mapping[str, Any]]) -> inspect.Signature:
-    """Return the signature of a constructor as its process has told it, with the options that all models have."""
-    built = [
-        inspect.Parameter(
-            each["name"],
-            inspect._ParameterKind(each["kind"]),
-            default=_read_default(each["default"]),
-            annotation=each["annotation"] or inspect.Parameter.empty,
-        )
-        for each in parameters
-    ]
-    taken = {parameter.name for parameter in built}
-    own = [
-        inspect.Parameter(name, inspect.Parameter.KEYWORD_ONLY, default=default, annotation=annotation)
-        for name, default, annotation in zip(DOOR, (True, None), ("bool", "float | None"), strict=True)
-        if name not in taken
-    ]
-    last = [parameter for parameter in built if parameter.kind is inspect.Parameter.VAR_KEYWORD]
-    return inspect.Signature([*(parameter for parameter in built if parameter not in last), *own, *last])
-
-
-def _read_default(told: Any) -> Any:
-    if told is None:
-        return inspect.Parameter.empty
-    return _Hidden(told["repr"]) if "repr" in told else told["value"]
-
-
 def _make_again(name: str, options: Mapping[str, Any]) -> Any:
     return find_isolated_model(name)(**options)
 
@@ -306,33 +223,14 @@ def load_model(host: Host, name: str) -> dict[str, Any]:
     host.thing = thing = WORLD_MODELS.find_here(name)
     host.make = partial(WORLD_MODELS.make_here, name)
     declared, requires = getattr(thing, "accepts", None), getattr(thing, "requires", Requirements())
-    makes = inspect.isclass(thing) or inspect.isroutine(thing) or isinstance(thing, partial)
     return {
-        "name": str(getattr(thing, "__name__", type(thing).__name__)),
-        "module": str(getattr(thing, "__module__", "")),
-        "doc": inspect.getdoc(thing) or "",
+        **tell_class(thing),
         "version": str(getattr(thing, "version", "")),
-        "parameters": [_tell_parameter(each) for each in inspect.signature(thing).parameters.values()] if makes else [],
         "accepts": declaration(declared) if isinstance(declared, Accepts) else "",
         "packages": list(requires.packages),
         "extra": requires.extra,
         "weights": requires.weights,
     }
-
-
-def _tell_parameter(parameter: inspect.Parameter) -> dict[str, Any]:
-    empty = inspect.Parameter.empty
-    annotation = "" if parameter.annotation is empty else inspect.formatannotation(parameter.annotation).strip("'")
-    value = parameter.default
-    plain = value is None or type(value) in (bool, int, float, str)
-    default = None if value is empty else {"value": value} if plain else {"repr": repr(value)}
-    return {"name": parameter.name, "kind": int(parameter.kind), "annotation": annotation, "default": default}
-
-
-def require_task(host: Host, task: Mapping[str, Any]) -> None:
-    """Ask the class whether it is made for a task; a factory takes any."""
-    if inspect.isclass(host.thing):
-        host.thing.require(task)
 
 
 def make_model(host: Host, options: Mapping[str, Any], seconds: float) -> str:

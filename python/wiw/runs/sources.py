@@ -15,7 +15,7 @@ from typing import Any
 import wiw
 from wiw.errors import StoreError
 from wiw.isolation.child import Host
-from wiw.isolation.models import IsolatedModel
+from wiw.isolation.source import Isolated
 from wiw.world_models.function import Function
 
 LIBRARIES = (
@@ -33,7 +33,7 @@ def source_digests(part: Any) -> dict[str, str]:
     notebook there is no file.
     """
     own = part if inspect.isclass(part) else type(part)
-    if issubclass(own, IsolatedModel):
+    if issubclass(own, Isolated):
         return dict(own.source.ask(_digest_loaded))
     while isinstance(part, partial):
         part = part.func
