@@ -32,6 +32,7 @@ FACES = {
     "registry",
     "suggestions",
     "networks",
+    "process_limits",
     "panorama",
     "scenes",
     "render",

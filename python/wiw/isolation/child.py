@@ -23,7 +23,7 @@ from numpy.typing import NDArray
 from wiw import errors
 from wiw.isolation.connection import receive, send
 from wiw.isolation.segments import map_segment
-from wiw.scenes.child import end_with_parent
+from wiw.process_limits import end_with_parent
 
 FIRST_TO_GO = 500
 """Out of 1000: where memory runs out, the kernel ends this process rather than the run's."""

@@ -36,7 +36,7 @@ from wiw.errors import InfrastructureError
 from wiw.isolation.connection import receive, send
 from wiw.isolation.failures import EndedError, ExitError, LateError, RaisedError
 from wiw.isolation.segments import Segment, SegmentPool, place
-from wiw.scenes.child import find_memory_limit
+from wiw.process_limits import find_memory_limit
 
 STARTING = 120.0
 """Seconds in which a child has to be there; it takes half of one on an idle machine."""
