@@ -210,6 +210,16 @@ def break_imports(*_):
     sys.modules["wiw"] = None
 
 
+def change_torch(*_):
+    try:
+        import torch
+    except ImportError:
+        return
+    torch.set_num_threads(7)
+    torch.set_default_dtype(torch.float64)
+    torch.manual_seed(7)
+
+
 FATAL = (
     segfault,
     abort,
@@ -249,6 +259,7 @@ HARMLESS = (
     change_answer_later,
     leak_descriptors,
     break_imports,
+    change_torch,
 )
 """Cost nothing: the answer is as it should be."""
 WAYS = (*FATAL, *FAILING, *HARMLESS)

@@ -80,7 +80,15 @@ def count_descriptors():
     return len(list(Path("/proc/self/fd").iterdir()))
 
 
-@pytest.mark.parametrize("way", WAYS, ids=lambda way: way.__name__)
+DEAR = ("change_torch",)
+"""Ways that are tried nightly."""
+
+
+@pytest.mark.parametrize(
+    "way",
+    [pytest.param(way, marks=pytest.mark.nightly if way.__name__ in DEAR else ()) for way in WAYS],
+    ids=lambda way: way.__name__,
+)
 def test_what_a_model_does_stays_in_its_process(model, way, capfd) -> None:
     before = describe_surroundings()
     hangs = way.__name__.startswith(("hang", "stop"))
@@ -257,3 +265,45 @@ def test_a_policy_decides_in_its_process_as_in_ours_and_cannot_take_the_run_with
     assert "its process ended with exit code 3" in log.episodes[2]["error"]
     with pytest.raises(RegistryError, match="expected a policy of your own"):
         wiw.policy("isolated:matcher")
+
+
+FATAL_MODEL = """
+import os
+
+import numpy as np
+
+import wiw
+from wiw._core import core
+
+
+class Fatal(wiw.WorldModel):
+    accepts = wiw.accepts(control="image", view="perspective", size=(8, 16))
+
+    def __init__(self, fatal: int = -1) -> None:
+        self.fatal = fatal
+
+    def rollout(self, observations, controls, seeds):
+        own = [core.fold_key([0, self.fatal, d, c]) for d in range(9) for c in range(3)] if self.fatal >= 0 else []
+        if set(own) & set(map(int, seeds)):
+            os._exit(3)
+        return np.repeat(observations.image[:, None], 1 + len(controls[0].actions), 1)
+"""
+
+
+def test_an_episode_that_ends_its_model_s_process_three_times_is_an_error_and_the_run_goes_on(tmp_path) -> None:
+    (tmp_path / "own.py").write_text(POLICY)
+    (tmp_path / "fatal.py").write_text(FATAL_MODEL)
+    task = TaskRecipe(f"{Path(__file__).with_name('fakes.py')}:line_task")
+
+    def run(name, **options):
+        recipe = AgentRecipe(f"{tmp_path / 'own.py'}:Own", f"{tmp_path / 'fatal.py'}:Fatal", model_options=options)
+        log = evaluate(task, recipe, 3, out=tmp_path / name, progress=False, live=2)
+        return log, {row["episode"]: row["metrics"] for row in log.episodes if row["status"] == "done"}
+
+    here, quiet = run("here", isolate=False)
+    there, disturbed = run("there", fatal=1)
+    (error,) = [row for row in there.episodes if row["status"] == "error"]
+    assert (error["episode"], error["kind"]) == (1, "world_model/ended")
+    assert "in 3 attempts; the last error: its process ended with exit code 3" in error["error"]
+    assert disturbed == {episode: quiet[episode] for episode in (0, 2)} and there.complete
+    assert here.store.config["arms"][0]["agent"]["model_options"] == {"isolate": False}

@@ -186,9 +186,9 @@ class IsolatedModel(WorldModel, Isolated):
         """Make the model in a process that has none; return its declaration."""
         self._spent_before += self._spent
         self._spent = Counter()
-        self._process, name = self.source.take_process(self._memory_gb), self.source.name
+        process, name = self.source.take_process(self._memory_gb), self.source.name
         try:
-            made: str = self._process.call(make_model, self._options, self._patience, seconds=self._patience)[0]
+            made: str = process.call(make_model, self._options, self._patience, seconds=self._patience)[0]
         except LateError as error:
             raise ConstructionError(
                 f"world model '{name}' cannot be made: its constructor did not return within {self._patience:g} s "
@@ -198,6 +198,7 @@ class IsolatedModel(WorldModel, Isolated):
             ) from error
         except (EndedError, ExitError) as error:
             raise ConstructionError(f"world model '{name}' cannot be made: {error}", error.kind) from None
+        self._process = process
         return made
 
 

@@ -19,6 +19,7 @@ from numpy.typing import NDArray
 from wiw.errors import ConstructionError, ContractError, RegistryError
 from wiw.isolation.child import Host
 from wiw.isolation.failures import EndedError, ExitError, LateError
+from wiw.isolation.process import ChildProcess
 from wiw.isolation.source import Isolated, Source, build_signature, read_file_state, require_task, tell_class
 from wiw.json_text import parse_json
 from wiw.policies.base import FrameSpec, Policy, Situation
@@ -81,8 +82,7 @@ class IsolatedPolicy(Policy, Isolated):
         self._memory_gb, self._deadline, self._options = memory_gb, deadline, options
         self._forgotten: list[int] = []
         self._spent: dict[str, float] = {}
-        self._process = self.source.take_process(memory_gb)
-        self._begin()
+        self._process = self._begin()
 
     def __reduce__(self) -> Any:
         options = {"memory_gb": self._memory_gb, "deadline": self._deadline, **self._options}
@@ -178,21 +178,21 @@ class IsolatedPolicy(Policy, Isolated):
             Exchange(**{**each, "said": tuple(each["said"])}) for each in json.loads(self._call(list_exchanges, key))
         )
 
-    def _begin(self) -> None:
-        """Make the policy in its process."""
-        name = self.source.name
+    def _begin(self) -> ChildProcess:
+        """Make the policy in a process that has none; return it."""
+        process, name = self.source.take_process(self._memory_gb), self.source.name
         try:
-            told = self._process.call(make_policy, self._options, seconds=self._deadline)[0]
+            told = process.call(make_policy, self._options, seconds=self._deadline)[0]
         except (EndedError, ExitError, LateError) as error:
             raise ConstructionError(f"policy '{name}' cannot be made: {error}", error.kind) from None
         self._told: dict[str, Any] = told
         for attribute, value in _read_declaration(told).items():
             setattr(self, attribute, value)
+        return process
 
     def _call(self, function: Any, *arguments: Any) -> Any:
         if not self._process.alive:
-            self._process = self.source.take_process(self._memory_gb)
-            self._begin()
+            self._process = self._begin()
         forgotten, self._forgotten[:] = list(self._forgotten), []
         value, spent = self._process.call(run_policy, forgotten, function, *arguments, seconds=self._deadline)[0]
         self._spent = {str(name): float(amount) for name, amount in spent.items()}

@@ -150,7 +150,7 @@ class ChildProcess:
             memory = self._request.lease(size)
             for offset, array in zip(offsets, arrays, strict=True):
                 memory[offset : offset + array.nbytes] = array
-        given = np.empty(0, np.uint8)
+        given: NDArray[np.uint8] = np.empty(0, np.uint8)
         if answer:
             segment = self._pool.find(answer)
             used.append(segment)
@@ -287,4 +287,5 @@ def _build_error(told: Any) -> Exception:
     own = getattr(errors, name, None) if name in errors.__all__ and name != "is_stop_request" else None
     if own is None:
         return RaisedError(text)
-    return own(text, kind) if isinstance(kind, str) else own(text)  # type: ignore[no-any-return]
+    error: Exception = own(text, kind) if isinstance(kind, str) else own(text)
+    return error

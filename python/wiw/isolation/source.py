@@ -137,5 +137,6 @@ class _Hidden:
 
 def require_task(host: Host, task: Mapping[str, Any]) -> None:
     """Ask the class whether it is made for a task, in its process; a factory takes any."""
-    if inspect.isclass(host.thing):
-        host.thing.require(task)
+    thing: Any = host.thing
+    if isinstance(thing, type) and hasattr(thing, "require"):
+        thing.require(task)
