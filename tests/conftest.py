@@ -50,6 +50,14 @@ BOXES = {  # name: material, least corner, greatest corner; metres, Y up
 }
 
 
+@pytest.fixture(autouse=True, scope="session")
+def no_salt() -> Iterator[None]:
+    """Leave keys plain where a test gives no salt: two runs draw the same, and test agents know an episode again."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr("wiw.loop.keys.draw_salt", lambda: "")
+        yield
+
+
 @pytest.hookimpl(wrapper=True)
 def pytest_collection() -> Generator[None, object, object]:
     """Leave what collection makes out of garbage collections: modules and tests live until the end."""

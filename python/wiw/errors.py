@@ -60,7 +60,7 @@ class RegistryError(Error, LookupError):
 class ConstructionError(Error):
     """A world model, a policy or another part cannot be made: its constructor failed.
 
-    `kind` is "raised", or "deadline" where it did not return in time.
+    `kind` is "raised", "deadline" where it did not return in time, or "ended" where it ended its process.
     """
 
     def __init__(self, message: str = "", kind: str = "raised") -> None:
@@ -107,7 +107,8 @@ class DeviceMemoryError(InfrastructureError):
 class RolloutError(InfrastructureError):
     """A world model gave no valid rollout after all retries.
 
-    `kind` is "raised", "deadline", or the kind of the `ContractError` that its answer was.
+    `kind` is "raised", "deadline", "ended" (its own process has), or the kind of the `ContractError` that its answer
+    was.
     """
 
     def __init__(self, message: str = "", kind: str = "raised") -> None:

@@ -43,6 +43,11 @@ class Registry:
     """`module:class` that things of this kind derive from, if they have to."""
     registered: dict[str, Any] = field(default_factory=dict)
     """What programs have added under names of their own (`register`)."""
+    door: str = ""
+    """`module:function` that returns what stands for a part of somebody else's, given its name, so that its code is
+    imported and run in a process of its own; empty where such parts are run in this one."""
+    prefix: str = ""
+    """What names begin with that are to go through the door; empty where those of all parts of somebody else's do."""
 
     def names(self) -> list[str]:
         """Return all registered names, built-in ones first."""
@@ -65,6 +70,20 @@ class Registry:
             RegistryError: unknown name; missing file, module or attribute; an exception while it was imported (the
                 cause); a class of another kind.
         """
+        if self.door and (name.startswith(self.prefix) if self.prefix else self.is_foreign(name)):
+            return _attribute(self.door)(name.removeprefix(self.prefix))
+        return self.find_here(name)
+
+    def is_foreign(self, name: str) -> bool:
+        """Return whether a name stands for code in a file or package that does not ship with wiw."""
+        if name in self.registered or name in self.built_in or name.partition(":")[0] + ":" in self.built_in:
+            return False
+        plugins = self._plugins()
+        path = plugins[name].value if name in plugins else name
+        return ":" in path and path.partition(":")[0].partition(".")[0] != "wiw"
+
+    def find_here(self, name: str) -> Any:
+        """Return the class or factory behind a name or path, imported into this process; errors as of `find`."""
         if name in self.registered:
             return self.registered[name]
         if name in self.built_in:
@@ -74,7 +93,7 @@ class Registry:
             return self._load(name, plugins[name].load)
         prefix, colon, argument = name.partition(":")
         if prefix + colon in self.built_in and argument:
-            return partial(self.find(prefix + colon), argument)
+            return partial(self.find_here(prefix + colon), argument)
         if colon:
             return self._load(name, partial(_attribute, name))
         hint = did_you_mean(name, self.names())
@@ -91,8 +110,12 @@ class Registry:
             RegistryError: see `find`; also when the options do not fit the constructor.
             ConstructionError: the constructor raised something else than an error of wiw (the cause).
         """
-        found = self.fitting(what, **options)
-        return self._check_kind(what, self._construct(what, found, options) if _makes(found) else found)
+        return self._make(what, self.fitting(what, **options), options)
+
+    def make_here(self, what: Any, **options: Any) -> Any:
+        """Return an instance as `make` does, whose code runs in this process."""
+        found = self.find_here(what) if isinstance(what, str) else what
+        return self._make(what, self._require_fitting(what, found, options), options)
 
     def fitting(self, what: Any, **options: Any) -> Any:
         """Return what `make` would call with these options, or the instance that it would return.
@@ -100,7 +123,12 @@ class Registry:
         Raises:
             RegistryError: as of `make`, but for what shows only as it is made.
         """
-        found = self.find(what) if isinstance(what, str) else what
+        return self._require_fitting(what, self.find(what) if isinstance(what, str) else what, options)
+
+    def _make(self, what: Any, found: Any, options: dict[str, Any]) -> Any:
+        return self._check_kind(what, self._construct(what, found, options) if _makes(found) else found)
+
+    def _require_fitting(self, what: Any, found: Any, options: dict[str, Any]) -> Any:
         if _makes(found):
             try:
                 inspect.signature(found).bind(**options)
@@ -229,7 +257,10 @@ WORLD_MODELS = Registry(
         "remote:": "wiw.world_models.remote.model:Remote",
     },
     "wiw.world_models.base:WorldModel",
+    door="wiw.isolation.models:find_isolated_model",
 )
+ISOLATED = "isolated:"
+"""What a policy's name begins with that is to run in a process of its own."""
 FUNCTION = "wiw.world_models.function:Function"
 """What makes a world model of a function."""
 POLICIES = Registry(
@@ -250,6 +281,8 @@ POLICIES = Registry(
         "explorer-oracle-tour": "wiw.experiments.privileged_explorers:OracleTourExplorer",
     },
     "wiw.policies.base:Policy",
+    door="wiw.isolation.policies:find_isolated_policy",
+    prefix=ISOLATED,
 )
 TASKS = Registry(
     "task",

@@ -66,7 +66,7 @@ def evaluate(out, episodes=EPISODES, reported=None, keep_images=2, shard=None, s
 
         RunStore.write = write_and_tell
     arms = {"none": LineAgent(0.5), "warp": LineAgent(0.8)}
-    place = {"out": out, "shard": shard, "scratch": scratch}
+    place = {"out": out, "shard": shard, "scratch": scratch, "salt": ""}
     run_arms(LineTask(), arms, episodes, **place, progress=False, resume=True, keep_images=keep_images)
 
 

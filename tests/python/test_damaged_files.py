@@ -21,10 +21,10 @@ import pytest
 from glb import Glb
 
 import wiw
-from wiw import scenes
+from wiw import process_limits, scenes
 from wiw.errors import Error, FileError, InfrastructureError
 from wiw.physics import Articulation, read_surface
-from wiw.scenes import child, isolated
+from wiw.scenes import isolated
 from wiw.tabletop.robot import load_robot
 
 SQUARE = np.array([[0, 0, 0], [1, 0, 0], [1, 1, 0], [0, 1, 0]], np.float32)
@@ -305,7 +305,7 @@ def test_the_importer_ends_with_its_parent(tmp_path: Path, monkeypatch: pytest.M
 
 
 def test_an_importer_without_its_parent_does_not_begin() -> None:
-    code = "from wiw.scenes.child import end_with_parent; end_with_parent(1 << 22); print('begun')"
+    code = "from wiw.process_limits import end_with_parent; end_with_parent(1 << 22); print('begun')"
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=False)
     assert done.returncode == 1 and done.stdout == ""
 
@@ -316,10 +316,10 @@ def test_a_container_s_memory_is_the_limit(tmp_path: Path, monkeypatch: pytest.M
     monkeypatch.setattr(resource, "getrlimit", lambda _: (resource.RLIM_INFINITY, resource.RLIM_INFINITY))
     (tmp_path / "max").write_text("max\n")
     (tmp_path / "some").write_text(f"{1 << 28}\n")
-    monkeypatch.setattr(child, "_CGROUPS", (str(tmp_path / "max"), str(tmp_path / "none")))
-    machine = child.limit_memory()
-    monkeypatch.setattr(child, "_CGROUPS", (str(tmp_path / "some"),))
-    assert child.limit_memory() == 3 << 26 < machine
+    monkeypatch.setattr(process_limits, "_CGROUPS", (str(tmp_path / "max"), str(tmp_path / "none")))
+    machine = process_limits.limit_memory()
+    monkeypatch.setattr(process_limits, "_CGROUPS", (str(tmp_path / "some"),))
+    assert process_limits.limit_memory() == 3 << 26 < machine
     assert [pair[0] for pair in limits] == [machine, 3 << 26]
 
 

@@ -28,7 +28,8 @@ TASK = f"{Path(__file__).with_name('fakes.py')}:line_task"
 
 
 def begin(out, scenes="", **options):
-    evaluate(TaskRecipe(TASK, {"scenes": scenes}), AgentRecipe("heuristic"), 6, out=out, progress=False, **options)
+    options = {"salt": "s", "progress": False, **options}
+    evaluate(TaskRecipe(TASK, {"scenes": scenes}), AgentRecipe("heuristic"), 6, out=out, **options)
 
 
 def set_session(run, seconds_ago, ended, **changes):

@@ -41,7 +41,7 @@ TIMES = {"outcome": ("seconds",), "decision": ("seconds", "spent", "calls")}
 
 def begin(out, episodes=7, agent="heuristic", **options):
     task = TaskRecipe(TASK, options.pop("task", {}))
-    return evaluate(task, AgentRecipe(agent), episodes, out=out, progress=False, **{"live": 3, **options})
+    return evaluate(task, AgentRecipe(agent), episodes, out=out, progress=False, **{"live": 3, "salt": "s", **options})
 
 
 def read_rows(run):
@@ -98,7 +98,7 @@ def test_with_world_models_pictures_and_scene_maps(tmp_path, two_rooms):
     task = TaskRecipe("imagenav", {"scenes": two_rooms, "decisions": 1, "backend": "cpu"})
 
     def run(name, **options):
-        given = {"arms": ["none", "placebo-swapped"], "progress": False, "keep_images": 1}
+        given = {"salt": "s", "arms": ["none", "placebo-swapped"], "progress": False, "keep_images": 1}
         evaluate(task, AgentRecipe("matcher", candidates=2), 3, out=tmp_path / name, **given, **options).close()
 
     run("whole", live=2)
@@ -113,7 +113,7 @@ def test_with_world_models_pictures_and_scene_maps(tmp_path, two_rooms):
 
 def test_the_command_line_runs_merges_and_compares(tmp_path, capsys):
     def run(*arguments):
-        given = ["--policy", "heuristic", "--episodes", "5", *map(str, arguments)]
+        given = ["--policy", "heuristic", "--episodes", "5", "--salt", "s", *map(str, arguments)]
         assert main(["run", TASK, *given]) == 0
         return capsys.readouterr()
 
@@ -271,7 +271,7 @@ from wiw.runs import scratch
 from wiw.studies.evaluate import run_arms
 scratch.PERIOD = {period}
 run_arms(LineTask(), {{"none": LineAgent(kill=(5,), marker={str(marker)!r})}}, 8, out={str(folder)!r},
-         progress=False, live=1, shard="1/1", scratch={str(tmp_path / "local")!r}, resume=True)
+         progress=False, live=1, shard="1/1", salt="", scratch={str(tmp_path / "local")!r}, resume=True)
 """
         environment = {**os.environ, "PYTHONPATH": os.pathsep.join(sys.path)}
         killed = subprocess.run([sys.executable, "-c", program], env=environment, check=False, timeout=100)

@@ -70,7 +70,8 @@ def test_a_part_counts_with_what_it_derives_from_and_imports(folder: Path, monke
 
 
 def test_a_function_counts_by_its_file(folder: Path) -> None:
-    model = wiw.world_model(wiw.world_model(f"{folder}/own.py:Own").rollout, accepts=wiw.accepts(control="image"))
+    own = wiw.world_model(f"{folder}/own.py:Own", isolate=False)
+    model = wiw.world_model(own.rollout, accepts=wiw.accepts(control="image"))
     assert {Path(path).name for path in source_digests(model)} == {"own.py", "shades.py"}
 
 

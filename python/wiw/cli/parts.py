@@ -86,10 +86,11 @@ class AgentFlags:
     world_model: Name = "none"
     """Name, path.py:Class or package.module:Class. See `wiw list`."""
     world_model_option: Options = ()
-    """An option of --world-model, such as weights=FOLDER or steps=30; may be given again."""
+    """An option of --world-model, such as weights=FOLDER or steps=30; may be given again. isolate=false runs a model of
+    your own in the process of the run."""
     policy: MaybeName = None
-    """Proposes plans; name or path.py:Class. If not given, the task's: matcher, for ar recogniser, for manipulation
-    scripted."""
+    """Proposes plans; name, path.py:Class, or isolated:path.py:Class for a process of its own. If not given, the
+    task's: matcher, for ar recogniser, for manipulation scripted."""
     policy_option: Options = ()
     """An option of --policy, such as weights=FILE; may be given again. Privileged counterparts in --arms take it
     too."""

@@ -54,7 +54,8 @@ def run(
     $ wiw run manipulation --tasks push_buttons,stack_cups --episodes 40 --arms none,copy,oracle
     $ wiw run ar --preset official --policy vlm --world-model svd --dry-run
     $ wiw run imagenav --arms none,warp --episodes 400 --until "warp-none excludes 0"
-    $ wiw run imagenav --arms none,warp --episodes 400 --shard 3/8 --out runs/a/3 --resume
+    $ wiw run imagenav --arms none,warp --episodes 400 --salt 7f3a --shard 3/8 --out runs/a/3 --resume
+    $ wiw run imagenav --policy isolated:my_policy.py:MyPolicy --world-model my_model.py:MyModel
 
     Ctrl-C (exit code 130) or SIGTERM (75, within 5 seconds) stops a run without loss; `wiw resume` continues it.
 

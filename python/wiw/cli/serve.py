@@ -17,7 +17,7 @@ from urllib.parse import urlsplit
 
 from tyro.conf import Positional, arg
 
-from wiw.cli.options import Options, model_options
+from wiw.cli.options import Options
 from wiw.wire.address_book import ServerAddress, announce_server
 
 SHOWN, LOGGED = 1.0, 10.0
@@ -71,12 +71,14 @@ def serve(
             folder. Only its owner can read it. Without --token one is made up.
         idle: Seconds without any client after which the server ends; never if not given.
     """
-    from wiw.registry import world_model
+    from wiw.registry import WORLD_MODELS
+    from wiw.runs.part_options import parse_options
     from wiw.serving.server import Server, Settings
 
     secret = token or os.environ.get("WIW_TOKEN") or (secrets.token_urlsafe() if announce is not None else None)
     settings = Settings(host, port, secret, queue, window, certificate, key, grace)
-    server = Server(world_model(model, **model_options(model, world_model_option)), settings)
+    options = parse_options(world_model_option, WORLD_MODELS.find_here(model), "--world-model-option")
+    server = Server(WORLD_MODELS.make_here(model, **options), settings)  # here: this process holds no simulator
     asyncio.run(_live(server, model, announce, idle))
     return 0
 

@@ -14,6 +14,7 @@ from wiw.cli.command_line import format_flags
 from wiw.cli.parts import AgentFlags, TaskFlags
 from wiw.cli.run import AGENT, SEARCH, SETTINGS, TASK, PreparedRun, prepare_run
 from wiw.errors import ArgumentError
+from wiw.loop import keys
 from wiw.loop.config import AgentConfig
 from wiw.runs.config import RunConfig
 from wiw.runs.shards import Shard
@@ -77,7 +78,7 @@ def submit(
     for name in ("shard", "resume"):
         if getattr(config, name):
             raise ArgumentError(f"submit: --{name} is what each job is given; leave it out")
-    prepared = prepare_run(task, parts, arms, rules, search, config)
+    prepared = prepare_run(task, parts, arms, rules, search, replace(config, salt=_find_salt(config)))
     folder, count = Path(prepared.settings.out or ""), prepared.count
     Shard(1, shards).select(count)
     serving = _write_servers(folder, parts, servers, jobs.cluster)
@@ -115,6 +116,17 @@ def cancel(run: Positional[Annotated[Path, arg(metavar="RUN")]], /) -> int:
     told = cancel_jobs(run)
     print(f"{run}: told {len(told)} jobs to end")
     return 0
+
+
+def _find_salt(config: RunConfig) -> str:
+    """Return the salt that all shards have: as given, as they were submitted with before, or a new one."""
+    from wiw.runs.submission import read_jobs
+
+    if config.salt is not None:
+        return config.salt
+    before = [job.arguments for job in read_jobs(Path(config.out))] if config.out is not None else []
+    found = [own[own.index("--salt") + 1] for own in before if "--salt" in own]
+    return found[0] if found else keys.draw_salt()
 
 
 def _write_command(

@@ -246,4 +246,15 @@ def make_observation(
     """Return the agent's observation, from the simulator's images."""
     if task.pointing is not None:
         images = task.pointing.split(images, int(state.episode.info["target"]))
-    return Observation(**images, odometry=odometry)
+    return Observation(**images, odometry=round_odometry(odometry))
+
+
+def round_odometry(odometry: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Return odometry [..., 3] to a tenth of a millimetre.
+
+    The simulator's positions are float32 in the scene's frame. How differences of such numbers are rounded tells which
+    of some given starts they are relative to; to a tenth of a millimetre they do not.
+    """
+    rounded = odometry.copy()
+    rounded[..., :2] = np.round(odometry[..., :2], 4) + 0.0  # no negative zeros
+    return rounded

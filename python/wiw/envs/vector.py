@@ -20,6 +20,7 @@ from wiw.envs.episode_state import (
     draw_episode,
     image_names,
     make_observation,
+    round_odometry,
     start_episode,
     wrap_episode,
 )
@@ -159,7 +160,7 @@ class VectorEnv(gymnasium.vector.VectorEnv[dict[str, Any], NDArray[np.int64], ND
 
     def _observe(self) -> dict[str, Any]:
         images = self._core.observe(self._images)
-        odometry = np.stack([self._core[place].odometry for place in range(self.num_envs)])
+        odometry = round_odometry(np.stack([self._core[place].odometry for place in range(self.num_envs)]))
         shown = {**images, "odometry": odometry}
         if self.task.pointing is not None:
             each = [self._observe_target(images, odometry, place) for place in range(self.num_envs)]

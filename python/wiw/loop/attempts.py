@@ -7,6 +7,9 @@ that a model that is merely slow is never entered twice at a time; then it asks 
 request to a server. A GPU kernel that never ends lets every try pass its deadline, and the episode fails. Compiled code
 that hangs while it holds Python's lock stops the process: nothing in it can look at a clock.
 
+A model in a process of its own (`wiw.isolation`) is asked in the caller's thread: where it is late, its process is
+killed, and the next try finds a new one.
+
 A model cannot end the process: `sys.exit()` in it is an error of its own like any exception. Threads that it starts in
 its constructor or in a call are daemons unless it says otherwise, for they are started in one.
 """
@@ -24,12 +27,14 @@ from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import ExitStack, contextmanager
 from contextvars import copy_context
 from functools import partial
-from typing import Any
+from typing import Any, cast
 
 import numpy as np
 from numpy.typing import NDArray
 
 from wiw.errors import ArgumentError, ConstructionError, ContractError, RolloutError, is_stop_request
+from wiw.isolation.failures import EndedError, ExitError, LateError, RaisedError
+from wiw.isolation.models import IsolatedModel, construction_deadline
 from wiw.loop.limits import DEADLINE
 from wiw.loop.model_wrapper import ModelWrapper
 from wiw.registry import WORLD_MODELS, world_model
@@ -37,6 +42,8 @@ from wiw.types import Conditioning, Control
 from wiw.world_models.base import WorldModel, answer_deadline, check_rollout
 
 TRIES = 3
+KINDS = (ContractError, RolloutError, LateError, ExitError, EndedError, RaisedError)
+"""Errors that say their own kind."""
 PAUSES = (0.2, 1.0)
 """Seconds before the second and the third try; a server that restarts may be back by then."""
 
@@ -111,7 +118,7 @@ class Attempted(ModelWrapper):
         self._tally["frames"] += sum(max(0, control.length - control.shared) for control in controls)
 
     def _build_error(self, error: Exception, errors: Sequence[str]) -> RolloutError:
-        kind = error.kind if isinstance(error, ContractError | RolloutError | LateError | ExitError) else "raised"
+        kind = error.kind if isinstance(error, KINDS) else "raised"
         name = type(self.model.unwrapped).__name__
         return RolloutError(
             f"{name} gave no usable answer in {len(errors)} attempts; the last error: {errors[-1]}", kind
@@ -120,6 +127,13 @@ class Attempted(ModelWrapper):
     def _ask(self, work: Callable[[], NDArray[np.uint8]]) -> NDArray[np.uint8]:
         if self.deadline > threading.TIMEOUT_MAX or "simulator" in self.model.accepts.needs:
             return work()
+        if isinstance(self.model.unwrapped, IsolatedModel):
+            try:
+                with answer_deadline(self.deadline):
+                    return work()
+            except LateError as error:
+                text = f"no answer within {self.deadline:g} s (deadline); its process was killed"
+                raise LateError(text) from error
         if self._thread is not None and not self._thread.wait_until_idle(self.deadline):
             self._thread = None
         if self._thread is None:
@@ -139,9 +153,13 @@ def make_model(what: Any, deadline: float = DEADLINE, **options: Any) -> WorldMo
         ConstructionError: the constructor raised, or did not return in time; and other errors of wiw that it raises.
     """
     found = WORLD_MODELS.find(what) if isinstance(what, str) else what
+    isolated = inspect.isclass(found) and issubclass(found, IsolatedModel) and options.get("isolate", True)
     makes = inspect.isclass(found) or isinstance(found, partial) or inspect.isfunction(found)
     fetches = inspect.isclass(found) and issubclass(found, WorldModel) and bool(found.requires.weights)
     make = partial(world_model, what, **options)
+    if isolated and not fetches:
+        with construction_deadline(deadline):
+            return cast(WorldModel, make())
     if not makes or fetches or deadline > threading.TIMEOUT_MAX:
         made: WorldModel | None = make()
         return made
@@ -155,18 +173,6 @@ def make_model(what: Any, deadline: float = DEADLINE, **options: Any) -> WorldMo
             "deadline",
         ) from error
     return made
-
-
-class LateError(Exception):
-    """The deadline has passed."""
-
-    kind = "deadline"
-
-
-class ExitError(Exception):
-    """A model has raised what is meant to end the process, such as `SystemExit`."""
-
-    kind = "raised"
 
 
 def _catch_exit(work: Callable[[], Any]) -> Any:
@@ -234,7 +240,8 @@ def _serve(items: queue.SimpleQueue[_WorkItem | None]) -> None:
 
 def _describe_error(error: Exception) -> str:
     text = " ".join(str(error).split())
-    return text if isinstance(error, ContractError | LateError | ExitError) else f"{type(error).__name__}: {text}"
+    told = ContractError | LateError | ExitError | EndedError | RaisedError
+    return text if isinstance(error, told) else f"{type(error).__name__}: {text}"
 
 
 def _read_torch_state() -> tuple[bool, bool, int | None] | None:

@@ -71,7 +71,7 @@ def imagine_primitives(model: WorldModel, request: Request) -> ImaginedPrimitive
         if accepts.history:
             flat = [actions for own in plans for actions in own]
             histories = RowHistories(accepts, batch, parts, flat, request.inputs, conditioning.image)
-        seeds = _seeds(batch, request.keys, request.origins)
+        seeds = _seeds(accepts, batch, request.keys, request.origins)
     answers: list[NDArray[np.uint8]] = []
     for part in parts:
         with clock("platform"):
@@ -221,8 +221,10 @@ def stack_depths(inputs: Sequence[ModelInput]) -> NDArray[np.float32]:
     return np.stack(depths)
 
 
-def _seeds(batch: Any, keys: Sequence[Key], origins: Sequence[Sequence[int]]) -> NDArray[np.uint64]:
-    """Return uint64 [rows], keyed by (run seed, episode, decision, candidate), whatever else is in the batch."""
+def _seeds(accepts: Accepts, batch: Any, keys: Sequence[Key], origins: Sequence[Sequence[int]]) -> NDArray[np.uint64]:
+    """Return uint64 [rows], keyed by (episode, decision, candidate), whatever else is in the batch; 0 without seeds."""
+    if not accepts.seeded:
+        return np.zeros(len(batch.row_owner), np.uint64)
     seeds = [seed_of(key, candidate) for key, numbers in zip(keys, origins, strict=True) for candidate in numbers]
     return np.array(seeds, np.uint64)[batch.row_owner]
 

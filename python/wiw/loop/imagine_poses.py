@@ -83,8 +83,9 @@ def _rows(accepts: Accepts, request: Request) -> tuple[list[_Row], list[list[int
             name = plan.actions.tobytes(), plan.text
             if name not in known:
                 known[name] = len(rows)
+                seed = seed_of(request.keys[episode], number) if accepts.seeded else 0
                 control = _control(accepts, plan, request.observations[episode].pose, request.wordless)
-                rows.append(_Row(episode, plan.actions, control, seed_of(request.keys[episode], number)))
+                rows.append(_Row(episode, plan.actions, control, seed))
         places.append([known[plan.actions.tobytes(), plan.text] for plan in plans])
     return rows, places
 

@@ -12,6 +12,7 @@ from typing import Any, Protocol
 
 from wiw.errors import ArgumentError, ContractError, JudgeError, RolloutError, VlmError, is_stop_request
 from wiw.loop.agent import Agent
+from wiw.loop.keys import make_key
 from wiw.loop.memory import Query
 from wiw.loop.privileged import LiveEnvironments
 from wiw.types import Decision, DecisionRecord, Episode, EpisodeResult, Key
@@ -74,13 +75,15 @@ def run_episodes(
     episodes: Sequence[tuple[int, Episode]],
     *,
     seed: int,
+    salt: str = "",
     live: int = 4,
     sink: Sink,
     pictured: Collection[int] = (),
 ) -> None:
     """Run (index, episode) pairs to their ends, at most `live` at a time.
 
-    Policies draw what they believe in the episodes whose index is in `pictured`.
+    Keys are made of seed and salt (`wiw.loop.keys`). Policies draw what they believe in the episodes whose index is in
+    `pictured`.
 
     An exception in an episode is infrastructure: the episode is recorded as an error and the rest go on. One in a batch
     may be due to any of its episodes, so each of them is run again by itself, after the others: what breaks does not
@@ -89,14 +92,14 @@ def run_episodes(
     """
     waiting, running, suspects = deque(episodes), list[LiveEpisode](), deque[tuple[int, Episode]]()
     envs = [task.environment(depth="depth" in agent.needs) for _ in range(min(live, len(episodes)))]
-    environments = LiveEnvironments()
+    environments, keys = LiveEnvironments(), {index: make_key(seed, index, salt) for index, _ in episodes}
     agent.grant(environments)
     try:
         while waiting or running or suspects:
             while waiting and envs:
-                running += _start(waiting.popleft(), envs, seed, sink, pictured)
+                running += _start(waiting.popleft(), envs, keys, sink, pictured)
             if not running and not waiting and suspects:
-                running += _start(suspects.popleft(), envs, seed, sink, pictured)
+                running += _start(suspects.popleft(), envs, keys, sink, pictured)
             for each in running:
                 environments.add(each.key, each.env)
             suspects += _advance(agent, running, sink)
@@ -111,7 +114,11 @@ def run_episodes(
 
 
 def _start(
-    item: tuple[int, Episode], envs: list[Any], seed: int, sink: Sink, pictured: Collection[int]
+    item: tuple[int, Episode],
+    envs: list[Any],
+    keys: Mapping[int, Key],
+    sink: Sink,
+    pictured: Collection[int],
 ) -> list[LiveEpisode]:
     """Begin an episode in one of the free environments; return it, unless it could not begin."""
     index, episode = item
@@ -126,7 +133,7 @@ def _start(
         envs.append(env)
         sink.episode(_build_error_result(index, episode, begin, "environment", error))
         return []
-    return [LiveEpisode(index, episode, env, Key(seed, index), observation, begin, north)]
+    return [LiveEpisode(index, episode, env, keys[index], observation, begin, north)]
 
 
 def _advance(agent: Agent, running: list[LiveEpisode], sink: Sink) -> list[tuple[int, Episode]]:

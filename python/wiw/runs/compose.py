@@ -19,6 +19,7 @@ from wiw.loop.agent import Agent
 from wiw.loop.agent_spec import AgentSpec, space_option
 from wiw.loop.attempts import Attempted, make_model
 from wiw.loop.imagination import Imaginer, ModelInput
+from wiw.loop.keys import make_key
 from wiw.loop.limits import DEADLINE, Limits
 from wiw.loop.model_imaginer import ModelImaginer
 from wiw.loop.rollout_cache import cache_rollouts
@@ -34,6 +35,12 @@ class RunContext:
 
     task: Any
     episodes: Sequence[Episode] = ()
+    seed: int = 0
+    salt: str = ""
+
+    def list_keys(self) -> list[Key]:
+        """Return the keys of the episodes' first decisions."""
+        return [make_key(self.seed, index, self.salt) for index in range(len(self.episodes))]
 
 
 @dataclass(frozen=True)
@@ -159,6 +166,7 @@ class NextEpisodes:
         self._context, self._needs = context, imaginer.accepts.needs
         self._depth = "depth" in imaginer.needs
         self._labels = isinstance(imaginer, Labelled) and imaginer.source == SIMULATOR and "semantic" in self._needs
+        self._indices = {(key.seed, key.episode): index for index, key in enumerate(context.list_keys())}
         self._env: Any = None
         self._moments: dict[tuple[int, int], ModelInput] = {}
 
@@ -166,7 +174,7 @@ class NextEpisodes:
         """Return the first observation of the next episode."""
         name = key.seed, key.episode
         if name not in self._moments:
-            self._moments[name] = self._begin((key.episode + 1) % len(self._context.episodes))
+            self._moments[name] = self._begin((self._indices[name] + 1) % len(self._context.episodes))
         return self._moments[name]
 
     def forget(self, key: Key) -> None:

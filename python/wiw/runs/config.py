@@ -42,6 +42,10 @@ class RunConfig(Limits, EngineConfig):
     its tasks."""
     seed: Annotated[int | None, arg(metavar="N")] = None
     """Seed of all randomness; the task's own, 0, if not given."""
+    salt: Annotated[str | None, arg(metavar="TEXT")] = None
+    """Secret under which policies and models get keys and seeds, so that these do not tell which episode it is. Drawn
+    and kept in the store if not given; give the same one to all shards, and to runs whose random draws are to be equal.
+    Empty: keys are seed and index."""
     out: Annotated[Path | str | None, arg(metavar="DIR")] = None
     """Folder of the run; runs/TASK-TIME if not given."""
     workers: Annotated[int, arg(metavar="N")] = 1

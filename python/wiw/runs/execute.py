@@ -116,9 +116,8 @@ def run_pending(
     info = store.info
     episodes = store.episodes()
     pictures = frozenset(info["pictures"])
-    spec = WorkerSpec(
-        task, agents, store.config["seed"], info["live"], pictures, info["limits"], episodes, info.get("sources", {})
-    )
+    seed, sources = store.config["seed"], info.get("sources", {})
+    spec = WorkerSpec(task, agents, seed, store.salt, info["live"], pictures, info["limits"], episodes, sources)
     board = make_board(progress and any(pending.values()))
     try:
         if any(pending.values()):

@@ -143,7 +143,7 @@ def _read_manifest(store: RunStore) -> dict[str, Any]:
     episodes = [{**asdict(episode), "geodesic": None} for episode in store.episodes()]  # may be measured in one alone
     limits = {name: info["limits"].get(name) for name in ("fidelity", "lpips")}
     kept = {name: info.get(name) for name in ("sources", "scenes")}
-    return {"wiw": store.wiw_version, **store.config, **limits, **kept, "episode": episodes}
+    return {"wiw": store.wiw_version, **store.config, "salt": store.salt, **limits, **kept, "episode": episodes}
 
 
 def _compare(first: Any, second: Any, place: str) -> Iterator[tuple[str, Any, Any]]:

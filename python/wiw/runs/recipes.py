@@ -23,7 +23,7 @@ from wiw.loop.imagination import Imaginer
 from wiw.loop.limits import Limits
 from wiw.loop.observers import Observer
 from wiw.policies.base import Policy
-from wiw.registry import POLICIES, SEMANTICS, TRACKERS, WORLD_MODELS
+from wiw.registry import ISOLATED, POLICIES, SEMANTICS, TRACKERS, WORLD_MODELS
 from wiw.runs.arm_text import EXAMPLE, ArmText, check_arm_name, parse_arm
 from wiw.runs.compose import Experiment, RunContext, compose, make_for_space, require_placebo
 from wiw.runs.part_options import parse_options
@@ -564,6 +564,8 @@ def error_of(arm: str) -> tuple[str | None, str | None]:
 
 def absolute(model: str) -> str:
     """`path.py:Class` with its path made absolute, so that it means the same in any folder; other names as they are."""
+    if model.startswith(ISOLATED):
+        return f"{ISOLATED}{absolute(model.removeprefix(ISOLATED))}"
     repeats, named = _split_repeat(model)
     if repeats:
         return model if named is None else f"{RESEEDED}:{absolute(named)}"

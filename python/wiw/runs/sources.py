@@ -14,6 +14,8 @@ from typing import Any
 
 import wiw
 from wiw.errors import StoreError
+from wiw.isolation.child import Host
+from wiw.isolation.source import Isolated
 from wiw.world_models.function import Function
 
 LIBRARIES = (
@@ -30,6 +32,9 @@ def source_digests(part: Any) -> dict[str, str]:
     Installed packages are left out. Of a class in a script that is run itself, the class alone counts; of one in a
     notebook there is no file.
     """
+    own = part if inspect.isclass(part) else type(part)
+    if issubclass(own, Isolated):
+        return dict(own.source.ask(_digest_loaded))
     while isinstance(part, partial):
         part = part.func
     part = part.function if isinstance(part, Function) else part
@@ -44,6 +49,11 @@ def source_digests(part: Any) -> dict[str, str]:
         else:
             found |= {str(path): _digest(path.read_bytes()) for path in _with_imports(file)}
     return found
+
+
+def _digest_loaded(host: Host) -> dict[str, str]:
+    """Return the digests of what a process of its own has loaded."""
+    return source_digests(host.thing)
 
 
 def require_sources(run: Path, begun_with: Mapping[str, str] | None, now: Mapping[str, str]) -> None:

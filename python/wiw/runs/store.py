@@ -297,6 +297,11 @@ class RunStore:
         return dict(parse_column("info", self._value("info"), str(self.path)))
 
     @property
+    def salt(self) -> str:
+        """The salt of keys and seeds (`wiw.loop.keys`); empty for a run that was begun without one."""
+        return str(self.info.get("salt", ""))
+
+    @property
     def shard(self) -> Shard | None:
         """The part of the episodes that this store is for; None for all of them."""
         named = self.info.get("shard")

@@ -110,7 +110,7 @@ def _run_again(store: RunStore, keys: set[tuple[str, int]]) -> dict[tuple[str, i
     limits = {**info.get("limits", {}), "cache": "off", "lpips": None}
     agents = {arm: recipe.replaying(store.path) for arm, recipe in agents.items()}
     pictures = frozenset(info["pictures"])
-    spec = WorkerSpec(task, agents, store.config["seed"], info["live"], pictures, limits, all_episodes)
+    spec = WorkerSpec(task, agents, store.config["seed"], store.salt, info["live"], pictures, limits, all_episodes)
     runner, found = Runner(spec), dict[tuple[str, int], Facts]()
     for arm in agents:
         indices = sorted(index for name, index in keys if name == arm)

@@ -57,6 +57,8 @@ class WorkerSpec:
     agents: Mapping[str, Any]
     """Recipes by arm."""
     seed: int
+    salt: str
+    """Of keys and seeds, as `wiw.loop.keys` has it."""
     live: int
     """Episodes kept live at a time in one process."""
     pictures: frozenset[int]
@@ -114,10 +116,13 @@ class Runner:
         """Run a job's episodes and send their rows."""
         from wiw.loop.scheduler import run_episodes
 
+        recipe = self._spec.agents[job.arm]
+        seed = mix_seed(self._spec.seed, recipe.reseed)
         if self._arm != job.arm:
             self._agent = None
-            self._agent = self._spec.agents[job.arm].build(
-                RunContext(self._task, self._spec.episodes), Limits(**self._spec.limits)
+            self._agent = recipe.build(
+                RunContext(self._task, self._spec.episodes, seed, self._spec.salt),
+                Limits(**self._spec.limits),
             )
             require_unchanged(self._spec.sources)
             self._arm = job.arm
@@ -127,7 +132,8 @@ class Runner:
             self._task,
             self._agent,
             job.episodes,
-            seed=mix_seed(self._spec.seed, self._spec.agents[job.arm].reseed),
+            seed=seed,
+            salt=self._spec.salt,
             live=self._spec.live,
             sink=sink,
             pictured=self._spec.pictures,

@@ -3,22 +3,14 @@
 
 from __future__ import annotations
 
-import ctypes
 import json
-import math
 import os
-import resource
-import signal
 import sys
 from collections.abc import Callable
-from contextlib import suppress
-from pathlib import Path
 from typing import Any
 
 from wiw.errors import Error
-
-_PR_SET_PDEATHSIG = 1
-_CGROUPS = ("/sys/fs/cgroup/memory.max", "/sys/fs/cgroup/memory/memory.limit_in_bytes")
+from wiw.process_limits import end_with_parent, limit_memory, limit_time
 
 
 def answer_job(read: Callable[[dict[str, Any]], dict[str, Any]]) -> None:
@@ -45,34 +37,3 @@ def _outcome(read: Callable[[dict[str, Any]], dict[str, Any]], job: dict[str, An
     except Exception as error:
         cause = f"cannot be read: {type(error).__name__}: {error} (damaged file; export it again)"
     return {"error": "FileError", "message": f"{job['path']}: {cause}"}
-
-
-def end_with_parent(parent: int) -> None:
-    """Have the kernel kill this process when its parent ends, also where the parent is killed; end if it is gone."""
-    if sys.platform == "linux":
-        ctypes.CDLL(None).prctl(_PR_SET_PDEATHSIG, signal.SIGKILL, 0, 0, 0)
-    if os.getppid() != parent:
-        sys.exit(1)
-
-
-def limit_time(seconds: float) -> None:
-    """End this process after so many seconds, or so many on all processors together."""
-    signal.signal(signal.SIGALRM, signal.SIG_DFL)
-    signal.alarm(max(1, math.ceil(seconds)))
-    _, hard = resource.getrlimit(resource.RLIMIT_CPU)
-    most = math.ceil(seconds) * (os.cpu_count() or 1)
-    resource.setrlimit(resource.RLIMIT_CPU, (most if hard == resource.RLIM_INFINITY else min(most, hard), hard))
-    resource.setrlimit(resource.RLIMIT_CORE, (0, resource.getrlimit(resource.RLIMIT_CORE)[1]))
-
-
-def limit_memory() -> int:
-    """Let this process take three quarters of the machine's or the container's memory; return that in bytes."""
-    most = os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES")
-    for file in _CGROUPS:
-        with suppress(OSError, ValueError):  # "max": no limit
-            most = min(most, int(Path(file).read_text()))
-    most = most * 3 // 4
-    _, hard = resource.getrlimit(resource.RLIMIT_DATA)
-    most = most if hard == resource.RLIM_INFINITY else min(most, hard)
-    resource.setrlimit(resource.RLIMIT_DATA, (most, hard))
-    return most

@@ -24,7 +24,7 @@ def serve_in_background(model: Any, **settings: Any) -> Iterator[Server]:
         ArgumentError: the model cannot be served, or a setting is out of range.
         InfrastructureError: the address cannot be listened at.
     """
-    server = Server(WORLD_MODELS.make(model), Settings(**{"port": 0, **settings}))
+    server = Server(WORLD_MODELS.make_here(model), Settings(**{"port": 0, **settings}))
     ready, failures = threading.Event(), list[BaseException]()
     loop = asyncio.new_event_loop()
 

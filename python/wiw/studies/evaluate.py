@@ -13,6 +13,7 @@ from typing import Any
 
 from wiw.analysis.stopping import StopRule, parse_stop_rule
 from wiw.errors import ArgumentError, Error, StoreError
+from wiw.loop import keys
 from wiw.loop.limits import Limits
 from wiw.metrics import Lpips
 from wiw.runs.config import EngineConfig, ResumeConfig, RunConfig, read_resume_settings, take_settings
@@ -164,7 +165,7 @@ def _run(task: Any, agents: Mapping[str, Any], settings: RunConfig) -> RunLog:
         require_own_sources(store, task, agents)
         _take_over(store, settings)
     else:
-        started = time.perf_counter()
+        started, salt = time.perf_counter(), _choose_salt(settings)
         episodes = built.episodes(count)
         used = built.require(episodes)
         folder = settings.out or Path("runs") / f"{built.name}-{datetime.now():%Y%m%d-%H%M%S}"
@@ -184,6 +185,7 @@ def _run(task: Any, agents: Mapping[str, Any], settings: RunConfig) -> RunLog:
             "tables": asdict(built.tables),
             **({} if settings.shard is None else {"shard": settings.shard}),
             **({} if settings.looks is None else {"until": settings.looks}),
+            "salt": salt,
             "live": settings.live,
             "workers": settings.workers,
             "engine": asdict(settings.place),
@@ -197,17 +199,32 @@ def _run(task: Any, agents: Mapping[str, Any], settings: RunConfig) -> RunLog:
     return _finish(store, task, agents, settings.workers, settings.progress, settings.place)
 
 
+def _choose_salt(settings: RunConfig) -> str:
+    """Return the salt of a new run: as given, or a random one.
+
+    Raises:
+        ArgumentError: none is given to a shard, though all shards of a run have the same.
+    """
+    if settings.salt is None and settings.shard is not None:
+        raise ArgumentError(
+            f"evaluate: shard {settings.shard} without a salt, which all shards of a run have in common; give each of "
+            f"them, say, --salt {keys.draw_salt()} (salt=)"
+        )
+    return keys.draw_salt() if settings.salt is None else settings.salt
+
+
 def _take_over(store: RunStore, settings: RunConfig) -> None:
     """Let a resumed run go on with these settings; closes the store where other things would be measured.
 
     Raises:
-        StoreError: fidelity was measured otherwise so far, or it is another shard.
+        StoreError: fidelity was measured otherwise so far, or it is another shard, or has another salt.
     """
     begun_with, now = Limits(**store.info["limits"]).to_json(), settings.to_json()
     begun_with["shard"], now["shard"] = store.info.get("shard"), settings.shard
     begun_with["until"], now["until"] = store.info.get("until"), settings.looks
     try:
-        names = ("fidelity", "fidelity_share", "lpips", "shard", "until")
+        begun_with["salt"], now["salt"] = store.salt, store.salt if settings.salt is None else settings.salt
+        names = ("fidelity", "fidelity_share", "lpips", "shard", "until", "salt")
         store.require_same(*({name: each[name] for name in names} for each in (begun_with, now)))
     except StoreError:
         store.close()

@@ -19,11 +19,12 @@ from numpy.typing import NDArray
 from wiw import action
 from wiw.action import FORWARD, TURN_LEFT, TURN_RIGHT
 from wiw.errors import ArgumentError, ConstructionError, ContractError
-from wiw.loop.attempts import DEADLINE, ExitError, LateError, make_model
+from wiw.isolation.failures import EndedError, ExitError, LateError, RaisedError
+from wiw.loop.attempts import DEADLINE, make_model
 from wiw.loop.history import Frame, stack_histories
 from wiw.loop.plan_space import plan_space
 from wiw.studies.frame_faults import describe_alteration, mean_correlation, measure_jump_fraction, swap_turns
-from wiw.studies.model_networks import place_of_computation, training_networks
+from wiw.studies.model_networks import find_place_of_computation, find_training_networks
 from wiw.studies.model_queries import Frames, ModelQueries, Row
 from wiw.types import GRIPPER_POSES, PRIMITIVES, Control, History
 from wiw.world_models.base import WorldModel
@@ -238,6 +239,8 @@ class _ModelExaminer:
             return ""
         except ContractError as error:
             finding = Finding(error.kind, f"{error}.")
+        except (EndedError, RaisedError) as error:
+            finding = Finding(error.kind, f"`rollout` failed: {error}.")
         except LateError:
             finding = Finding(
                 "deadline",
@@ -246,7 +249,9 @@ class _ModelExaminer:
                 "is only slow, give it a longer deadline, here and in the run, or a smaller best_batch.",
             )
         except ExitError as error:
-            text = f"`rollout` raised {_locate(error.__cause__ or error)}. Raise an Exception to report a failure."
+            cause = error.__cause__
+            said = error if cause is None else _locate(cause)
+            text = f"`rollout` raised {said}. Raise an Exception to report a failure."
             finding = Finding("raised", text)
         except Exception as error:
             finding = Finding("raised", f"`rollout` raised {_locate(error)}.")
@@ -351,7 +356,7 @@ class _ModelExaminer:
                 )
 
     def _check_training_mode(self) -> Iterator[Finding]:
-        for path, layers in training_networks(self.model):
+        for path, layers in find_training_networks(self.model):
             yield Finding(
                 "training",
                 f"{path} is in training mode, with {', '.join(layers)}: dropout draws without the seeds, and batch "
@@ -416,20 +421,19 @@ class _ModelExaminer:
             )
 
     def _check_inputs(self) -> Iterator[Finding]:
-        if self.queries.changed:
-            changed = ", ".join(sorted(self.queries.changed))
-            yield Finding("inputs", f"It changes what it is given: {changed}. Work on a copy.")
+        if changed := self.queries.watch().changed:
+            yield Finding("inputs", f"It changes what it is given: {', '.join(changed)}. Work on a copy.")
 
     def _check_memory(self) -> Iterator[Finding]:
         time.sleep(SETTLE)  # for a thread that still writes
-        self.queries.check_rewrites()
-        if self.queries.reuses:
+        watched = self.queries.watch()
+        if watched.reuses:
             yield Finding(
                 "memory",
                 "An answer lies in the memory of an earlier one, which is still looked at when the next call is made. "
                 "Return an array of its own, as frames.copy().",
             )
-        elif self.queries.rewrites:
+        elif watched.rewrites:
             yield Finding(
                 "memory",
                 "An answer was written to after it was returned, while it was being looked at: by a later call, a "
@@ -469,7 +473,7 @@ class _ModelExaminer:
         """Return a finding, which is not serious where it may be rounding."""
         if off.max() > NOISE:
             return Finding(kind, text)
-        where = place_of_computation(self.model)
+        where = find_place_of_computation(self.model)
         cause = {
             "gpu": "So little may come of the order in which a GPU adds up.",
             "cpu": "So little may be rounding: a CPU adds up in another order where batches or threads differ.",

@@ -7,11 +7,33 @@ import sys
 from collections.abc import Iterator, Mapping
 from typing import Any, Literal
 
+from wiw.isolation.child import Host
+from wiw.isolation.models import IsolatedModel
 from wiw.world_models.base import WorldModel
 from wiw.world_models.remote.model import Remote
 
 NESTED = 3
 """Objects inside each other that are looked into for networks."""
+
+
+def find_training_networks(model: WorldModel) -> list[tuple[str, list[str]]]:
+    """Return where a model holds networks in training mode, wherever it runs; see `training_networks`."""
+    if not isinstance(model, IsolatedModel):
+        return training_networks(model)
+    return [(str(path), list(map(str, layers))) for path, layers in model.ask(_list_training_networks)]
+
+
+def find_place_of_computation(model: WorldModel) -> str:
+    """Return where a model computes, wherever it runs; see `place_of_computation`."""
+    return str(model.ask(_tell_place)) if isinstance(model, IsolatedModel) else place_of_computation(model)
+
+
+def _list_training_networks(host: Host) -> list[tuple[str, list[str]]]:
+    return training_networks(host.made.unwrapped)
+
+
+def _tell_place(host: Host) -> str:
+    return place_of_computation(host.made.unwrapped)
 
 
 def training_networks(model: WorldModel) -> list[tuple[str, list[str]]]:

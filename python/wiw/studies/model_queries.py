@@ -4,7 +4,6 @@
 from __future__ import annotations
 
 import time
-from collections import deque
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from typing import Any
@@ -23,20 +22,14 @@ from wiw.loop.imagine import seed_of
 from wiw.loop.plan_space import plan_space
 from wiw.policies.base import FrameSpec, Situation
 from wiw.registry import TASKS
+from wiw.studies.call_watch import Watched, read_watch, watch_calls
 from wiw.types import GRIPPER_POSES, PRIMITIVES, Conditioning, Control, History, Key, Proposal, View
 from wiw.world_models.base import Accepts, WorldModel
-from wiw.world_models.pictures import sample
 
 EPISODES = 2
-REMEMBERED = 4
-"""Answers that are looked at again."""
 SMALL = 96
 """Columns of true frames."""
 TRUE_PANORAMA = (288, 512)
-PLAN = ("actions", "trajectory", "viewpoints", "ids")
-"""Arrays of a control."""
-PAST = ("images", "poses", "actions", "lengths", "count")
-"""Arrays of a history."""
 Frames = NDArray[np.uint8]
 
 
@@ -72,7 +65,8 @@ class ModelQueries:
     """
 
     def __init__(self, model: WorldModel, scenes: str, deadline: float = DEADLINE) -> None:
-        self._model, self._attempts = model, Attempted(model, deadline)
+        self._model, self._watch = model, watch_calls(model)
+        self._attempts = Attempted(self._watch, deadline)
         self._space = model.accepts.space
         episodes = (
             _begin_manipulation_episodes() if self._space == GRIPPER_POSES else _begin_navigation_episodes(scenes)
@@ -80,14 +74,10 @@ class ModelQueries:
         self._moments = [_begin_with_history(model.accepts, *each) for each in episodes]
         self.row_seconds = 0.0
         """Seconds a row took in the last call."""
-        self.changed: set[str] = set()
-        """Names of the inputs that the model has changed."""
-        self.reuses = False
-        """Whether an answer lay in the memory of an earlier one."""
-        self.rewrites = False
-        """Whether an answer has changed after it was given."""
-        self._answers: deque[tuple[Frames, Frames]] = deque(maxlen=REMEMBERED)
-        """The latest answers themselves, and what a sample of their pixels was when they came."""
+
+    def watch(self) -> Watched:
+        """Return what the model has done to its inputs and answers so far."""
+        return read_watch(self._watch)
 
     def rows(self, plans: Sequence[Sequence[Any]]) -> list[Row]:
         """Return the rows of these plans, of primitives or poses, in each episode."""
@@ -144,27 +134,7 @@ class ModelQueries:
             simulators=None if rows[0].simulator is None else [row.simulator for row in rows],
         )
         controls, seeds = [row.control for row in rows], np.array([row.seed for row in rows], np.uint64)
-        given = [("seeds", seeds)]
-        given += [(f"observations.{name}", getattr(observations, name)) for name in ("image", "depth", "semantic")]
-        if observations.history is not None:
-            past = observations.history
-            given += [(f"observations.history.{name}", getattr(past, name)) for name in PAST]
-        given += [(f"control.{name}", getattr(control, name)) for control in controls for name in PLAN]
-        given = [(name, array) for name, array in given if array is not None]
-        kept = [array.copy() for _, array in given]
-        frames = self._attempts.once(observations, controls, seeds)
-        self.changed |= {
-            name for (name, array), before in zip(given, kept, strict=True) if not np.array_equal(array, before)
-        }
-        self.reuses |= any(np.may_share_memory(frames, earlier) for earlier, _ in self._answers)
-        answer = np.array(frames)
-        self.check_rewrites()
-        self._answers.append((frames, sample(answer)))
-        return answer
-
-    def check_rewrites(self) -> None:
-        """Set `rewrites` if a recent answer has been written to since."""
-        self.rewrites |= any(not np.array_equal(sample(frames), before) for frames, before in self._answers)
+        return np.array(self._attempts.once(observations, controls, seeds))  # a model may write to it later
 
     def true_frames(self, rows: Sequence[Row], plans: Sequence[NDArray[Any]]) -> list[Frames]:
         """Return what an agent would truly see after each action of a plan, for the place of each row.
@@ -187,8 +157,8 @@ class _RequestRecorder(WorldModel):
 
     @property
     def accepts(self) -> Accepts:  # type: ignore[override]
-        """The model's."""
-        return self._model.accepts
+        """The model's; with seeds in any case, by which a row is known again."""
+        return replace(self._model.accepts, seeded=True)
 
     def rollout(
         self, observations: Conditioning, controls: Sequence[Control], seeds: NDArray[np.uint64]

@@ -50,6 +50,8 @@ class Accepts:
     cacheable: bool = False
     history: int = 0
     """Frames of `Conditioning.history`, the observation included; 0 where the model needs none."""
+    seeded: bool = True
+    """Whether answers depend on the seeds; a model without random numbers is handed zeros."""
 
 
 def accepts(
@@ -67,6 +69,7 @@ def accepts(
     template: TextTemplate | None = None,
     cacheable: bool = False,
     history: int | None = None,
+    seeded: bool = True,
 ) -> Accepts:
     """Declares what a world model takes and gives (paper, section "Unified Action API").
 
@@ -89,6 +92,8 @@ def accepts(
             takes long and whose answer is a function of what it is handed: not for one that draws without the seeds,
             nor for a server that may change.
         history: frames of the history with needs=("history",), the observation included; None means 4.
+        seeded: whether answers depend on the seeds. A model that draws no random numbers says False: it is handed
+            zeros, and its cached rollouts serve every run, whatever the salt of its seeds.
 
     Raises:
         ArgumentError: a value is not one of the above, or a history is given that is not needed.
@@ -123,6 +128,7 @@ def accepts(
         template,
         cacheable,
         history,
+        seeded,
     )
 
 
@@ -206,7 +212,8 @@ class WorldModel(ABC):
         Args:
             observations: B rows in the declared view and size.
             controls: B rows; frame k is what follows action k.
-            seeds: uint64 [B], one per row, so that results do not depend on how rows are batched.
+            seeds: uint64 [B], one per row, so that results do not depend on how rows are batched; 0 where `accepts`
+                says seeded=False.
 
         Returns:
             uint8 [B, T, H, W, 3] with T = actions + 1; frame 0 is the observation. In memory that later calls leave
@@ -341,6 +348,17 @@ def check_rollout(
     """
     observed = sample(observations.image).copy()  # a model may write into what it is handed
     frames = model.rollout(observations, controls, seeds)
+    require_frames(model, frames, controls)
+    check_pictures(type(model.unwrapped).__name__, observed, frames, controls)
+    return frames
+
+
+def require_frames(model: WorldModel, frames: Any, controls: Sequence[Control]) -> None:
+    """Require the type, dtype, shape and number of frames that were asked for.
+
+    Raises:
+        ContractError: they are others, or there are NaN.
+    """
     expected = (len(controls), len(controls[0].actions) + 1, *model.accepts.size, 3)
     if not isinstance(frames, np.ndarray) or frames.dtype != np.uint8 or frames.shape != expected:
         kind, came = _breach(frames, expected)
@@ -349,8 +367,6 @@ def check_rollout(
             f"width, 3), got {came}",
             kind,
         )
-    check_pictures(type(model.unwrapped).__name__, observed, frames, controls)
-    return frames
 
 
 def _breach(frames: Any, expected: tuple[int, ...]) -> tuple[str, str]:

@@ -16,7 +16,7 @@ from wiw.world_models.base import WorldModel, accepts
 class Copy(WorldModel):
     """Predict that every future frame equals the present one. A model that scores no better has added nothing."""
 
-    accepts = accepts(control="image", view="panorama", causal=True, best_batch=64)
+    accepts = accepts(control="image", view="panorama", causal=True, best_batch=64, seeded=False)
     version = "1"
 
     def rollout(
@@ -31,7 +31,7 @@ class Copy(WorldModel):
 class CopyFront(Copy):
     """Repeat the front view of a manipulator's fixed camera."""
 
-    accepts = accepts(control="image", view="perspective", causal=True, best_batch=64)
+    accepts = accepts(control="image", view="perspective", causal=True, best_batch=64, seeded=False)
 
 
 def make_copy(space: str = PRIMITIVES) -> Copy:

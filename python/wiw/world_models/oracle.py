@@ -31,7 +31,7 @@ class Oracle(WorldModel):
         ArgumentError: no size, or a view that the plans do not lead through.
     """
 
-    accepts = accepts(control="action", view="panorama", needs=("simulator",), causal=True, best_batch=64)
+    accepts = accepts(control="action", view="panorama", needs=("simulator",), causal=True, best_batch=64, seeded=False)
 
     def __init__(self, size: Sequence[int] | None = None, view: View | None = None) -> None:
         own = type(self).accepts
@@ -83,7 +83,9 @@ class Oracle(WorldModel):
 class ArmOracle(Oracle):
     """Send a fork of the physics to each pose of a plan, one after another, and return what it truly sees."""
 
-    accepts = accepts(control="action", space=GRIPPER_POSES, view="perspective", needs=("simulator",), best_batch=64)
+    accepts = accepts(
+        "action", space=GRIPPER_POSES, view="perspective", needs=("simulator",), best_batch=64, seeded=False
+    )
 
     def rollout(
         self, observations: Conditioning, controls: Sequence[Control], seeds: NDArray[np.uint64]

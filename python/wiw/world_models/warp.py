@@ -20,7 +20,7 @@ class Warp(WorldModel):
     video generator that scores less has not learnt what one depth image already tells.
     """
 
-    accepts = accepts(control="trajectory", view="panorama", needs=("depth",), causal=True, best_batch=64)
+    accepts = accepts(control="trajectory", view="panorama", needs=("depth",), causal=True, best_batch=64, seeded=False)
     version = "1"
 
     def __init__(self, view: View = "panorama", size: tuple[int, int] | None = None) -> None:

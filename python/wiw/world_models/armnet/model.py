@@ -41,7 +41,14 @@ class ArmNet(Trained):
     """
 
     accepts = accepts(
-        control="action", space=GRIPPER_POSES, view="perspective", size=SIZE, causal=True, best_batch=16, cacheable=True
+        control="action",
+        space=GRIPPER_POSES,
+        view="perspective",
+        size=SIZE,
+        causal=True,
+        best_batch=16,
+        cacheable=True,
+        seeded=False,
     )
 
     @classmethod

@@ -39,7 +39,7 @@ class WarpNet(Trained):
         WeightsError: no such file, damaged, or of another version.
     """
 
-    accepts = accepts(control="trajectory", view="panorama", causal=True, best_batch=16, cacheable=True)
+    accepts = accepts(control="trajectory", view="panorama", causal=True, best_batch=16, cacheable=True, seeded=False)
 
     @staticmethod
     def _load(weights: str | Path | None) -> tuple[Network, dict[str, Any]]:

@@ -1,0 +1,28 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The ways in which a call of somebody else's code fails, beyond the exceptions that it raises."""
+
+from __future__ import annotations
+
+
+class LateError(Exception):
+    """The deadline has passed."""
+
+    kind = "deadline"
+
+
+class ExitError(Exception):
+    """The code has raised what is meant to end the process, such as `SystemExit`."""
+
+    kind = "raised"
+
+
+class EndedError(Exception):
+    """The process of the code has ended, or closed its connection, in the middle of a call."""
+
+    kind = "ended"
+
+
+class RaisedError(Exception):
+    """The code has raised an exception in a process of its own; the message has its type, text and place."""
+
+    kind = "raised"

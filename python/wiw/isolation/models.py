@@ -1,0 +1,267 @@
+# SPDX-License-Identifier: Apache-2.0
+"""World models of one's own, each in a process of its own.
+
+`find_isolated_model` returns a class that stands for the one behind a name: it tells the same about itself, and an
+instance of it passes each rollout on to the instance in its process. Nothing of the model's code is imported here.
+"""
+
+from __future__ import annotations
+
+import json
+import math
+from collections import Counter
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
+from contextvars import ContextVar
+from functools import lru_cache, partial
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from wiw.errors import ArgumentError, ConstructionError, RegistryError
+from wiw.isolation.child import Host
+from wiw.isolation.failures import EndedError, ExitError, LateError, RaisedError
+from wiw.isolation.process import ChildProcess
+from wiw.isolation.source import Isolated, Source, build_signature, read_file_state, require_task, tell_class
+from wiw.json_text import parse_json
+from wiw.registry import WORLD_MODELS
+from wiw.types import Conditioning, Control
+from wiw.world_models.base import Accepts, Requirements, WorldModel, answer_deadline, require_frames, seconds_left
+from wiw.world_models.remote.declaration import declaration, parse_declaration
+
+DOOR = {"isolate": (True, "bool"), "memory_gb": (None, "float | None")}
+"""Options of every model of one's own, which its constructor does not see."""
+RESTARTS = 2
+"""Calls in a row that raise, after which the process is started anew."""
+
+
+_PATIENCE: ContextVar[float] = ContextVar("wiw_patience", default=math.inf)
+
+
+@contextmanager
+def construction_deadline(seconds: float) -> Iterator[None]:
+    """Set the seconds that constructors of isolated models may take inside the block, and whenever they start anew."""
+    token = _PATIENCE.set(seconds)
+    try:
+        yield
+    finally:
+        _PATIENCE.reset(token)
+
+
+def find_isolated_model(name: str) -> type[IsolatedModel]:
+    """Return the class that stands for the world model of a name, such as "model.py:MyModel".
+
+    Raises:
+        RegistryError: it cannot be imported, which is tried in a process of its own.
+    """
+    return _make_class(name, read_file_state(name))
+
+
+@lru_cache(64)
+def _make_class(name: str, state: tuple[str, int, int] | None) -> type[IsolatedModel]:
+    """Return the class of a name; an edited file has another one."""
+    source = Source("world model", name, load_model)
+    told = source.told
+    attributes: dict[str, Any] = {
+        "source": source,
+        "version": told["version"],
+        "requires": Requirements(packages=tuple(told["packages"]), extra=told["extra"], weights=told["weights"]),
+        "__signature__": build_signature(told["parameters"], DOOR),
+        "__module__": told["module"],
+        "__doc__": told["doc"],
+    }
+    if told["accepts"]:
+        attributes["accepts"] = _Declared(parse_declaration(told["accepts"]))
+    return type(told["name"], (IsolatedModel,), attributes)
+
+
+class IsolatedModel(WorldModel, Isolated):
+    """Stands for a world model in a process of its own.
+
+    Args:
+        isolate: False makes the model in this process instead, and returns it itself.
+        memory_gb: most gigabytes of memory that its process may take; three quarters of the machine's if not given.
+        options: what the model is made with.
+
+    Raises:
+        ConstructionError: the constructor raised, did not return in time, or ended its process; and errors of wiw that
+            it raised.
+        ArgumentError: the model asks for the simulator.
+    """
+
+    def __new__(cls, isolate: bool = True, memory_gb: float | None = None, **options: Any) -> Any:
+        """Return an instance of this class, or the model itself where it is not isolated."""
+        return super().__new__(cls) if isolate else WORLD_MODELS.make_here(cls.source.name, **options)
+
+    def __init__(self, isolate: bool = True, memory_gb: float | None = None, **options: Any) -> None:
+        self._memory_gb, self._options = memory_gb, options
+        self._patience, self._failures = _PATIENCE.get(), 0
+        self._spent, self._spent_before = Counter[str](), Counter[str]()
+        self._process: ChildProcess | None = None
+        self._accepts = parse_declaration(self._begin())
+        if "simulator" in self._accepts.needs:
+            raise ArgumentError(
+                f"world model '{self.source.name}' needs the simulator, which only the oracle is handed; to study a "
+                "privileged model of your own, give it isolate=false"
+            )
+
+    def __reduce__(self) -> Any:
+        return _make_again, (self.source.name, {"memory_gb": self._memory_gb, **self._options})
+
+    @property
+    def accepts(self) -> Accepts:  # type: ignore[override]
+        """The model's declaration."""
+        return self._accepts
+
+    @property
+    def spent(self) -> Mapping[str, float]:
+        """Resources that the model has used up so far, in all of its processes."""
+        return self._spent_before + self._spent
+
+    @classmethod
+    def require(cls, task: Mapping[str, Any]) -> None:
+        """Ask the class whether it is made for a task.
+
+        Raises:
+            ArgumentError: it is not.
+        """
+        cls.source.ask(require_task, dict(task))
+
+    def describe(self) -> dict[str, Any]:
+        """Return what the model says of itself."""
+        described: dict[str, Any] = parse_json(self.ask(describe_model))
+        return described
+
+    def fingerprint(self) -> str:
+        """Return the model's own."""
+        return str(self.ask(fingerprint_model))
+
+    def ask(self, function: Callable[..., Any], *arguments: Any) -> Any:
+        """Call a function on the model in its process; see `ChildProcess.call`."""
+        return self._find_process().call(function, *arguments)[0]
+
+    def rollout(
+        self, observations: Conditioning, controls: Sequence[Control], seeds: NDArray[np.uint64]
+    ) -> NDArray[np.uint8]:
+        """Return the model's frames; those that nobody reads (shared ones, padding) are left unwritten.
+
+        Raises:
+            LateError: there is no answer by the caller's deadline; the process is killed.
+            EndedError: the process has ended. As with other failures, the next call finds a new one.
+            ContractError: the answer breaks the contract.
+            RaisedError: the model raised an exception.
+        """
+        seconds = seconds_left()
+        shape = (len(controls), len(controls[0].actions) + 1, *self._accepts.size, 3)
+        process = self._find_process()
+        try:
+            spent, answer = process.call(
+                roll_out,
+                *(observations, list(controls), np.asarray(seeds), seconds),
+                seconds=seconds,
+                answer=math.prod(shape),
+            )
+        except (RaisedError, ExitError):
+            self._failures += 1
+            if self._failures % RESTARTS == 0:  # what it has leaked or broken goes with its process
+                process.kill()
+            raise
+        self._failures = 0
+        self._spent = Counter({str(name): float(value) for name, value in spent.items()})
+        return answer.reshape(shape)
+
+    def close(self) -> None:
+        """End the process; the next call starts another one."""
+        if self._process is not None:
+            self._process.kill()
+
+    def _find_process(self) -> ChildProcess:
+        if self._process is None or not self._process.alive:
+            self._begin()
+        assert self._process is not None
+        return self._process
+
+    def _begin(self) -> str:
+        """Make the model in a process that has none; return its declaration."""
+        self._spent_before += self._spent
+        self._spent = Counter()
+        process, name = self.source.take_process(self._memory_gb), self.source.name
+        try:
+            made: str = process.call(make_model, self._options, self._patience, seconds=self._patience)[0]
+        except LateError as error:
+            raise ConstructionError(
+                f"world model '{name}' cannot be made: its constructor did not return within {self._patience:g} s "
+                "(deadline). Does it wait for a download, a lock, a server or a prompt? If it is only slow, give a "
+                "longer deadline",
+                "deadline",
+            ) from error
+        except (EndedError, ExitError) as error:
+            raise ConstructionError(f"world model '{name}' cannot be made: {error}", error.kind) from None
+        self._process = process
+        return made
+
+
+class _Declared:
+    """A declaration that class and instances tell: the instances their own."""
+
+    def __init__(self, declared: Accepts) -> None:
+        self._declared = declared
+
+    def __get__(self, model: IsolatedModel | None, kind: type) -> Accepts:
+        return self._declared if model is None else model._accepts
+
+
+def _make_again(name: str, options: Mapping[str, Any]) -> Any:
+    return find_isolated_model(name)(**options)
+
+
+# -- in the model's process --------------------------------------------------------------------------------------------
+
+
+def load_model(host: Host, name: str) -> dict[str, Any]:
+    """Import the class or factory behind a name; return what it tells before it is called."""
+    host.thing = thing = WORLD_MODELS.find_here(name)
+    host.make = partial(WORLD_MODELS.make_here, name)
+    declared, requires = getattr(thing, "accepts", None), getattr(thing, "requires", Requirements())
+    return {
+        **tell_class(thing),
+        "version": str(getattr(thing, "version", "")),
+        "accepts": declaration(declared) if isinstance(declared, Accepts) else "",
+        "packages": list(requires.packages),
+        "extra": requires.extra,
+        "weights": requires.weights,
+    }
+
+
+def make_model(host: Host, options: Mapping[str, Any], seconds: float) -> str:
+    """Make the model; return its declaration."""
+    with answer_deadline(seconds):
+        host.made = host.make(**options)
+    if not isinstance(host.made, WorldModel):
+        raise RegistryError(f"expected a world model, got {host.made!r}; 'none' stands for no world model")
+    return declaration(host.made.accepts)
+
+
+def describe_model(host: Host) -> str:
+    """Return what the model says of itself, as JSON."""
+    return json.dumps(host.made.describe())
+
+
+def fingerprint_model(host: Host) -> str:
+    """Return the model's fingerprint."""
+    return str(host.made.fingerprint())
+
+
+def roll_out(
+    host: Host, observations: Conditioning, controls: Sequence[Control], seeds: NDArray[np.uint64], seconds: float
+) -> dict[str, float]:
+    """Write the model's frames into the memory of the answer; return what it has used up so far."""
+    with answer_deadline(seconds):
+        frames = host.made.rollout(observations, controls, seeds)
+    require_frames(host.made, frames, controls)
+    answer = host.answer.reshape(frames.shape)
+    for own, row, control in zip(answer, frames, controls, strict=True):
+        own[0] = row[0]
+        own[1 + control.shared : 1 + control.length] = row[1 + control.shared : 1 + control.length]
+    return {name: float(value) for name, value in host.made.spent.items()}

@@ -1,0 +1,353 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Policies of one's own, each in a process of its own, by the name "isolated:policy.py:MyPolicy".
+
+The memories of episodes stay in that process; the loop holds handles of them.
+"""
+
+from __future__ import annotations
+
+import json
+import weakref
+from collections.abc import Mapping, Sequence
+from dataclasses import asdict, replace
+from functools import lru_cache, partial
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from wiw.errors import ConstructionError, ContractError, RegistryError
+from wiw.isolation.child import Host
+from wiw.isolation.failures import EndedError, ExitError, LateError
+from wiw.isolation.process import ChildProcess
+from wiw.isolation.source import Isolated, Source, build_signature, read_file_state, require_task, tell_class
+from wiw.json_text import parse_json
+from wiw.policies.base import FrameSpec, Policy, Situation
+from wiw.registry import POLICIES
+from wiw.types import Answer, Decision, Exchange, Goal, Key, Proposal, Rollout, TextAnswer
+from wiw.wire.arrays import pack_array, unpack_array
+
+DOOR = {"memory_gb": (None, "float | None"), "deadline": (600.0, "float")}
+"""Options of every isolated policy, which its constructor does not see."""
+
+
+def find_isolated_policy(name: str) -> type[IsolatedPolicy]:
+    """Return the class that stands for the policy of a name, such as "policy.py:MyPolicy".
+
+    Raises:
+        RegistryError: it cannot be imported, which is tried in a process of its own; or it ships with wiw.
+    """
+    if not POLICIES.is_foreign(name):
+        raise RegistryError(f"isolated: expected a policy of your own, as isolated:path.py:Class, got '{name}'")
+    return _make_class(name, read_file_state(name))
+
+
+@lru_cache(64)
+def _make_class(name: str, state: tuple[str, int, int] | None) -> type[IsolatedPolicy]:
+    """Return the class of a name; an edited file has another one."""
+    source = Source("policy", name, load_policy)
+    told = source.told
+    attributes: dict[str, Any] = {
+        "source": source,
+        "__signature__": build_signature(told["parameters"], DOOR),
+        "__module__": told["module"],
+        "__doc__": told["doc"],
+        **_read_declaration(told),
+    }
+    return type(told["name"], (IsolatedPolicy,), attributes)
+
+
+class _MemoryHandle:
+    """Stands for the memory of an episode that lies in the policy's process."""
+
+    def __init__(self, number: int) -> None:
+        self.number = number
+
+
+class IsolatedPolicy(Policy, Isolated):
+    """Stands for a policy in a process of its own.
+
+    A call that fails or is late loses all memories: its episodes end with errors, or begin anew.
+
+    Args:
+        memory_gb: most gigabytes of memory that its process may take; three quarters of the machine's if not given.
+        deadline: most seconds for a call.
+        options: what the policy is made with.
+
+    Raises:
+        ConstructionError: the constructor raised, did not return in time, or ended its process.
+    """
+
+    def __init__(self, memory_gb: float | None = None, deadline: float = 600.0, **options: Any) -> None:
+        self._memory_gb, self._deadline, self._options = memory_gb, deadline, options
+        self._forgotten: list[int] = []
+        self._spent: dict[str, float] = {}
+        self._process = self._begin()
+
+    def __reduce__(self) -> Any:
+        options = {"memory_gb": self._memory_gb, "deadline": self._deadline, **self._options}
+        return _make_again, (self.source.name, options)
+
+    @classmethod
+    def require(cls, task: Mapping[str, Any]) -> None:
+        """Ask the class whether it is made for a task.
+
+        Raises:
+            ArgumentError: it is not.
+        """
+        cls.source.ask(require_task, dict(task))
+
+    @property
+    def can_revise(self) -> bool:
+        """Whether the policy scores imagined futures itself."""
+        return bool(self._told["can_revise"])
+
+    @property
+    def can_extend(self) -> bool:
+        """Whether the policy can propose from an imagined place."""
+        return bool(self._told["can_extend"])
+
+    @property
+    def spent(self) -> Mapping[str, float]:
+        """Resources used so far."""
+        return self._spent
+
+    def describe(self) -> dict[str, Any]:
+        """Return what the policy says of itself."""
+        described: dict[str, Any] = parse_json(self._told["described"])
+        return described
+
+    def begin(self, goal: Goal, key: Key) -> Any:
+        """Begin an episode there; return a handle of its memory."""
+        handle = _MemoryHandle(int(self._call(begin_episode, goal, key)))
+        weakref.finalize(handle, self._forgotten.append, handle.number).atexit = False
+        return handle
+
+    def observe(self, situations: Sequence[Situation]) -> None:
+        """Pass the call on."""
+        self._call(observe, _hide_memories(situations))
+
+    def propose(self, situations: Sequence[Situation], candidates: int, horizon: int) -> list[list[Proposal]]:
+        """Return the policy's plans."""
+        return _read_plans(self._call(propose, _hide_memories(situations), candidates, horizon))
+
+    def extend(self, situations: Sequence[Situation], candidates: int, horizon: int) -> list[list[Proposal]]:
+        """Return the policy's continuations."""
+        return _read_plans(self._call(extend, _hide_memories(situations), candidates, horizon))
+
+    def score(
+        self,
+        situations: Sequence[Situation],
+        proposals: Sequence[Sequence[Proposal]],
+        rollouts: Sequence[Sequence[Rollout]],
+    ) -> list[NDArray[np.float64]]:
+        """Return the policy's scores."""
+        found = self._call(score, _hide_memories(situations), proposals, rollouts)
+        return [_read_array("score", each) for each in found]
+
+    def revise(
+        self, situation: Situation, proposals: Sequence[Proposal], scores: NDArray[np.float64]
+    ) -> tuple[NDArray[Any], int | None]:
+        """Return the policy's decision."""
+        actions, chosen = self._call(revise, _hide_memories([situation])[0], proposals, scores)
+        return _read_array("revise", actions), None if chosen is None else int(chosen)
+
+    def answer(
+        self,
+        situations: Sequence[Situation],
+        proposals: Sequence[Sequence[Proposal]],
+        rollouts: Sequence[Sequence[Rollout] | None],
+    ) -> Sequence[Answer | TextAnswer | None]:
+        """Return what the policy believes."""
+        if not self._told["answers"]:
+            return [None] * len(situations)
+        return [_read_answer(each) for each in self._call(answer, _hide_memories(situations), proposals, rollouts)]
+
+    def draw(self, situation: Situation, decision: Decision, north: float) -> Mapping[str, NDArray[np.uint8]]:
+        """Return the policy's pictures."""
+        if not self._told["draws"]:
+            return {}
+        found = self._call(draw, _hide_memories([situation])[0], replace(decision, key=None), north)
+        return {str(name): _read_array("draw", each) for name, each in found.items()}
+
+    def exchanges(self, key: Key) -> tuple[Exchange, ...]:
+        """Return the language model's exchanges of this decision."""
+        if not self._told["exchanges"]:
+            return ()
+        return tuple(
+            Exchange(**{**each, "said": tuple(each["said"])}) for each in json.loads(self._call(list_exchanges, key))
+        )
+
+    def _begin(self) -> ChildProcess:
+        """Make the policy in a process that has none; return it."""
+        process, name = self.source.take_process(self._memory_gb), self.source.name
+        try:
+            told = process.call(make_policy, self._options, seconds=self._deadline)[0]
+        except (EndedError, ExitError, LateError) as error:
+            raise ConstructionError(f"policy '{name}' cannot be made: {error}", error.kind) from None
+        self._told: dict[str, Any] = told
+        for attribute, value in _read_declaration(told).items():
+            setattr(self, attribute, value)
+        return process
+
+    def _call(self, function: Any, *arguments: Any) -> Any:
+        if not self._process.alive:
+            self._process = self._begin()
+        forgotten, self._forgotten[:] = list(self._forgotten), []
+        value, spent = self._process.call(run_policy, forgotten, function, *arguments, seconds=self._deadline)[0]
+        self._spent = {str(name): float(amount) for name, amount in spent.items()}
+        return value
+
+
+def _make_again(name: str, options: Mapping[str, Any]) -> Any:
+    return find_isolated_policy(name)(**options)
+
+
+def _hide_memories(situations: Sequence[Situation]) -> list[Situation]:
+    """Return situations with the numbers of their memories."""
+    return [replace(each, memory=each.memory.number) for each in situations]
+
+
+def _read_declaration(told: Mapping[str, Any]) -> dict[str, Any]:
+    view, size, ends = told["frames"]
+    height, width = size
+    return {
+        "space": str(told["space"]),
+        "needs": tuple(map(str, told["needs"])),
+        "frames": FrameSpec(str(view), (int(height), int(width)), bool(ends)),
+        "default_revision": None if told["default_revision"] is None else str(told["default_revision"]),
+    }
+
+
+def _read_plans(told: Any) -> list[list[Proposal]]:
+    return [[Proposal(_read_array("propose", actions), *rest) for actions, *rest in own] for own in told]
+
+
+def _read_array(call: str, told: Any) -> NDArray[Any]:
+    return unpack_array(call, told).copy()
+
+
+def _read_answer(told: Any) -> Answer | TextAnswer | None:
+    if told is None:
+        return None
+    if "text" in told:
+        return TextAnswer(str(told["text"]), float(told["confidence"]), bool(told["final"]))
+    raw = None if told["raw"] is None else _read_array("answer", told["raw"])
+    return Answer(tuple(map(str, told["choices"])), _read_array("answer", told["probabilities"]), raw)
+
+
+# -- in the policy's process -------------------------------------------------------------------------------------------
+
+
+def load_policy(host: Host, name: str) -> dict[str, Any]:
+    """Import the class or factory behind a name; return what it tells before it is called."""
+    host.thing = POLICIES.find_here(name)
+    host.make = partial(POLICIES.make_here, name)
+    return {**tell_class(host.thing), **_declare(host.thing)}
+
+
+def _declare(thing: Any) -> dict[str, Any]:
+    """Return what a class, or an instance, declares."""
+    names = ("space", "needs", "frames", "default_revision")
+    told = {name: getattr(thing, name, getattr(Policy, name)) for name in names}
+    told = {name: getattr(Policy, name) if isinstance(value, property) else value for name, value in told.items()}
+    frames = told["frames"]
+    return {**told, "needs": list(told["needs"]), "frames": (frames.view, tuple(frames.size), frames.ends)}
+
+
+def make_policy(host: Host, options: Mapping[str, Any]) -> dict[str, Any]:
+    """Make the policy; return what it declares and has."""
+    host.made, host.memories, host.count = host.make(**options), {}, 0
+    made, kind = host.made, type(host.made)
+    return {
+        **_declare(made),
+        "described": json.dumps(made.describe()),
+        "can_revise": made.can_revise,
+        "can_extend": made.can_extend,
+        "answers": kind.answer is not Policy.answer,
+        "draws": kind.draw is not Policy.draw,
+        "exchanges": kind.exchanges is not Policy.exchanges,
+    }
+
+
+def run_policy(host: Host, forgotten: Sequence[int], function: Any, *arguments: Any) -> tuple[Any, dict[str, float]]:
+    """Call a function of this module on the policy; return its value and what the policy has used up so far."""
+    for number in forgotten:
+        host.memories.pop(number, None)
+    value = function(host, *arguments)
+    return value, {name: float(amount) for name, amount in host.made.spent.items()}
+
+
+def begin_episode(host: Host, goal: Goal, key: Key) -> int:
+    """Begin an episode; return the number of its memory."""
+    host.count += 1
+    host.memories[host.count] = host.made.begin(goal, key)
+    return host.count
+
+
+def observe(host: Host, situations: Sequence[Situation]) -> None:
+    """Let the policy update its memories."""
+    host.made.observe(_show_memories(host, situations))
+
+
+def propose(host: Host, situations: Sequence[Situation], candidates: int, horizon: int) -> Any:
+    """Return the policy's plans as plain values."""
+    return _tell_plans(host.made.propose(_show_memories(host, situations), candidates, horizon))
+
+
+def extend(host: Host, situations: Sequence[Situation], candidates: int, horizon: int) -> Any:
+    """Return the policy's continuations as plain values."""
+    return _tell_plans(host.made.extend(_show_memories(host, situations), candidates, horizon))
+
+
+def score(host: Host, situations: Sequence[Situation], proposals: Any, rollouts: Any) -> Any:
+    """Return the policy's scores."""
+    return [_tell_array(each) for each in host.made.score(_show_memories(host, situations), proposals, rollouts)]
+
+
+def revise(host: Host, situation: Situation, proposals: Any, scores: Any) -> Any:
+    """Return the plan that the policy decides on, and its number."""
+    actions, chosen = host.made.revise(_show_memories(host, [situation])[0], proposals, scores)
+    return _tell_array(actions), None if chosen is None else int(chosen)
+
+
+def answer(host: Host, situations: Sequence[Situation], proposals: Any, rollouts: Any) -> Any:
+    """Return what the policy believes."""
+    return [_tell_answer(each) for each in host.made.answer(_show_memories(host, situations), proposals, rollouts)]
+
+
+def draw(host: Host, situation: Situation, decision: Decision, north: float) -> Any:
+    """Return the policy's pictures."""
+    found = host.made.draw(_show_memories(host, [situation])[0], decision, north)
+    return {name: _tell_array(picture) for name, picture in found.items()}
+
+
+def list_exchanges(host: Host, key: Key) -> str:
+    """Return the exchanges of a decision as JSON."""
+    return json.dumps([asdict(each) for each in host.made.exchanges(key)])
+
+
+def _show_memories(host: Host, situations: Sequence[Situation]) -> list[Situation]:
+    missing = [each.memory for each in situations if each.memory not in host.memories]
+    if missing:
+        raise RuntimeError("the policy's process has ended since, and with it the memory of this episode")
+    return [replace(each, memory=host.memories[each.memory]) for each in situations]
+
+
+def _tell_plans(plans: Any) -> Any:
+    if not isinstance(plans, Sequence) or not all(isinstance(each, Proposal) for own in plans for each in own):
+        raise ContractError(f"propose: expected a list of wiw.types.Proposal for each episode, got {plans!r:.200}")
+    return [[(_tell_array(each.actions), float(each.prior), each.note, each.text) for each in own] for own in plans]
+
+
+def _tell_array(array: Any) -> Any:
+    return pack_array(np.asarray(array))
+
+
+def _tell_answer(believed: Answer | TextAnswer | None) -> Any:
+    if believed is None:
+        return None
+    if isinstance(believed, TextAnswer):
+        return {"text": believed.text, "confidence": float(believed.confidence), "final": bool(believed.final)}
+    raw = None if believed.raw is None else _tell_array(believed.raw)
+    return {"choices": list(believed.choices), "probabilities": _tell_array(believed.probabilities), "raw": raw}

@@ -1,0 +1,142 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Code of somebody else's, imported in processes of its own: what it says of its class, and processes to make it in."""
+
+from __future__ import annotations
+
+import inspect
+from collections.abc import Callable, Mapping, Sequence
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+from wiw.errors import InfrastructureError, RegistryError
+from wiw.isolation.child import Host
+from wiw.isolation.failures import EndedError, ExitError
+from wiw.isolation.process import ChildProcess
+
+
+class Source:
+    """The code behind a name, imported in a process in which nothing has been made of it so far.
+
+    Args:
+        kind: as in messages: "world model".
+        name: of the part.
+        load: imports it in the child, and returns what it tells of itself.
+    """
+
+    def __init__(self, kind: str, name: str, load: Callable[[Host, str], dict[str, Any]]) -> None:
+        self.kind, self.name, self._load = kind, name, load
+        self._idle: ChildProcess | None = None
+        self.told = self.load(process := ChildProcess())
+        self._idle = process
+
+    def ask(self, function: Callable[..., Any], *arguments: Any) -> Any:
+        """Call a function on the imported class; see `ChildProcess.call`."""
+        if self._idle is None or not self._idle.alive:
+            self._idle = ChildProcess()
+            self.load(self._idle)
+        return self._idle.call(function, *arguments)[0]
+
+    def take_process(self, memory_gb: float | None) -> ChildProcess:
+        """Return a process that has imported the code; nobody else has it."""
+        if memory_gb is None and self._idle is not None and self._idle.alive:
+            process, self._idle = self._idle, None
+            return process
+        process = ChildProcess(memory_gb)
+        self.load(process)
+        return process
+
+    def load(self, process: ChildProcess) -> dict[str, Any]:
+        """Import the code in a process; return what it says of itself.
+
+        Raises:
+            RegistryError: it cannot be imported.
+            InfrastructureError: it is not what it was when it was imported first.
+        """
+        try:
+            told: dict[str, Any] = process.call(self._load, self.name)[0]
+        except (EndedError, ExitError) as error:
+            raise RegistryError(f"{self.kind} '{self.name}' cannot be loaded: {error}") from None
+        first = getattr(self, "told", told)
+        if (told["module"], told["name"]) != (first["module"], first["name"]):  # the module's name has the file's state
+            raise InfrastructureError(f"{self.kind} '{self.name}' has changed since it was loaded; begin a new run")
+        return told
+
+
+class Isolated:
+    """Base of what stands for a part in a process of its own."""
+
+    source: Source
+
+
+def read_file_state(name: str) -> tuple[str, int, int] | None:
+    """Return what tells versions of the file of "path.py:Class" apart; None for a name without a file."""
+    path = Path(name.rpartition(":")[0]).expanduser()
+    if path.suffix != ".py" or not path.is_file():
+        return None
+    status = path.stat()
+    return str(path.resolve()), status.st_mtime_ns, status.st_size
+
+
+def tell_class(thing: Any) -> dict[str, Any]:
+    """Return what a class or factory tells of itself before it is called."""
+    makes = inspect.isclass(thing) or inspect.isroutine(thing) or isinstance(thing, partial)
+    return {
+        "name": str(getattr(thing, "__name__", type(thing).__name__)),
+        "module": str(getattr(thing, "__module__", "")),
+        "doc": inspect.getdoc(thing) or "",
+        "parameters": [_tell_parameter(each) for each in inspect.signature(thing).parameters.values()] if makes else [],
+    }
+
+
+def _tell_parameter(parameter: inspect.Parameter) -> dict[str, Any]:
+    empty = inspect.Parameter.empty
+    annotation = "" if parameter.annotation is empty else inspect.formatannotation(parameter.annotation).strip("'")
+    value = parameter.default
+    plain = value is None or type(value) in (bool, int, float, str)
+    default = None if value is empty else {"value": value} if plain else {"repr": repr(value)}
+    return {"name": parameter.name, "kind": int(parameter.kind), "annotation": annotation, "default": default}
+
+
+def build_signature(parameters: Sequence[Mapping[str, Any]], own: Mapping[str, tuple[Any, str]]) -> inspect.Signature:
+    """Return the signature of a constructor as its process has told it, with options of our own (default, type)."""
+    built = [
+        inspect.Parameter(
+            each["name"],
+            inspect._ParameterKind(each["kind"]),
+            default=_read_default(each["default"]),
+            annotation=each["annotation"] or inspect.Parameter.empty,
+        )
+        for each in parameters
+    ]
+    taken = {parameter.name for parameter in built}
+    added = [
+        inspect.Parameter(name, inspect.Parameter.KEYWORD_ONLY, default=default, annotation=annotation)
+        for name, (default, annotation) in own.items()
+        if name not in taken
+    ]
+    last = [parameter for parameter in built if parameter.kind is inspect.Parameter.VAR_KEYWORD]
+    return inspect.Signature([*(parameter for parameter in built if parameter not in last), *added, *last])
+
+
+def _read_default(told: Any) -> Any:
+    if told is None:
+        return inspect.Parameter.empty
+    return _Hidden(told["repr"]) if "repr" in told else told["value"]
+
+
+class _Hidden:
+    """A default value that the class keeps to itself."""
+
+    def __init__(self, text: str) -> None:
+        self._text = text
+
+    def __repr__(self) -> str:
+        return self._text
+
+
+def require_task(host: Host, task: Mapping[str, Any]) -> None:
+    """Ask the class whether it is made for a task, in its process; a factory takes any."""
+    thing: Any = host.thing
+    if isinstance(thing, type) and hasattr(thing, "require"):
+        thing.require(task)
