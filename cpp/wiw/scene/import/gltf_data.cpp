@@ -20,6 +20,7 @@ struct ComponentType {
   float most;  // of the integer, which is 1 where it is normalised
 };
 constexpr std::uint64_t kFloat = 5126;
+constexpr std::size_t kMostZeroRows = 10'000'000;  // of an accessor that has no bytes but those of its changes
 constexpr std::array<ComponentType, 6> kComponents{
     {{5120, 1, 127.f}, {5121, 1, 255.f}, {5122, 2, 32767.f}, {5123, 2, 65535.f}, {5125, 4, 1.f}, {kFloat, 4, 1.f}}};
 
@@ -200,8 +201,12 @@ std::size_t GltfData::checked_count(const Json& accessor) const {
 GltfValues GltfData::read(std::size_t index) {
   const Json& accessor = document_.root["accessors"].items().at(index);
   GltfValues values{checked_count(accessor), components_of(accessor["type"].text()), {}};
+  const bool is_zero = accessor["bufferView"].is_null();
+  if (is_zero && (accessor["sparse"].is_null() || values.count > kMostZeroRows)) {
+    fail("accessor " + std::to_string(index) + " has no data");
+  }
   values.numbers.resize(values.count * values.components);
-  if (!accessor["bufferView"].is_null() && values.count > 0) {
+  if (!is_zero && values.count > 0) {
     const Elements elements = this->elements(accessor, accessor, values.components);
     for (std::size_t i = 0; i < values.count; ++i) {
       for (std::size_t c = 0; c < values.components; ++c) values.row(i)[c] = elements.value(i, c);
