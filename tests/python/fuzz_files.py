@@ -10,7 +10,7 @@ from pathlib import Path
 
 import cv2
 from glb import Glb
-from test_damaged_files import DAE, PLY, SDF, binary_ply, posed_glb, textured_glb
+from test_damaged_files import DAE, OBJ, PLY, SDF, binary_ply, posed_glb, textured_glb
 from test_gltf import (
     DRACO,
     SQUARE,
@@ -28,7 +28,9 @@ DATA = Path(__file__).parents[1] / "data"
 
 
 def write_all(folder: Path) -> None:
-    for name, content in (("ascii.ply", PLY), ("binary.ply", binary_ply()), ("part.dae", DAE), ("box.sdf", SDF)):
+    plain = {"ascii.ply": PLY, "binary.ply": binary_ply(), "part.dae": DAE, "box.sdf": SDF}
+    plain["part.obj"] = OBJ.replace(b"m.mtl", b"sample.mtl")
+    for name, content in plain.items():
         (folder / name).write_bytes(content)
     (folder / "textured.glb").write_bytes(textured_glb())
     (folder / "posed.glb").write_bytes(posed_glb())

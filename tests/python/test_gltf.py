@@ -342,7 +342,7 @@ def test_one_image_serves_several_samplers(tmp_path: Path) -> None:
     glb.textured(1)
     unlit(glb)
     for i in (0, 1):
-        glb.node(glb.mesh(TWO, i, POSITION=SQUARE * (0.5, 1, 1) + np.float32([0.5 * i, 0, 0]), TEXCOORD_0=uv))
+        glb.node(glb.mesh(TWO, i, POSITION=np.float32([0.5, 1, 1]) * SQUARE + np.float32([0.5 * i, 0, 0]), TEXCOORD_0=uv))
     entries = {"samplers": [{"wrapS": 33071, "wrapT": 33071}], "textures": [{"source": 0}, {"source": 0, "sampler": 0}]}
     scene = load(save(glb, tmp_path / "a.glb", **entries))
     left, right = SQUARE * (0.5, 1, 1), SQUARE * (0.5, 1, 1) + (0.5, 0, 0)

@@ -34,12 +34,13 @@ void load_or_refuse(const std::filesystem::path& file) {
   CHECK(std::chrono::steady_clock::now() - begin < std::chrono::seconds(10));
 }
 
-/// Small files of every format, and those of the folder that WIW_FUZZ_FILES names.
+/// Small files of every format, or those of the folder that WIW_FUZZ_FILES names, which may refer to sample.mtl.
 std::vector<std::filesystem::path> subjects(const Folder& folder) {
   std::vector<std::filesystem::path> files = write_samples(folder);
-  const char* more = std::getenv("WIW_FUZZ_FILES");
-  if (more == nullptr) return files;
-  for (const auto& entry : std::filesystem::directory_iterator(more)) files.push_back(entry.path());
+  const char* others = std::getenv("WIW_FUZZ_FILES");
+  if (others == nullptr) return files;
+  files.clear();
+  for (const auto& entry : std::filesystem::directory_iterator(others)) files.push_back(entry.path());
   std::ranges::sort(files);
   return files;
 }

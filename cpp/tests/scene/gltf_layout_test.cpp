@@ -68,7 +68,6 @@ TEST_CASE("JSON is read as it is written") {
   CHECK_THROWS_WITH_AS(wiw::scene::Json::parse(std::string(100'000, '[')), doctest::Contains("nested"), wiw::Error);
 }
 
-
 TEST_CASE("glTF accessors and views must lie inside what they read") {
   CHECK_NOTHROW(check_layout({}));
   const std::string in_view = R"("bufferView":0,)";
