@@ -27,7 +27,8 @@ class Part:
 def cast_parts(parts: list[Part], eye: NDArray[np.float64]) -> tuple[NDArray[np.float64], NDArray[np.int64]]:
     """Return colour [H, W, 3] and part [H, W] that a camera at `eye` sees along -z.
 
-    Parts count from 1; 0 is where nothing is. Textures are read bilinearly, or at the nearest texel, from their largest level.
+    Parts count from 1; 0 is where nothing is. Textures are read bilinearly, or at the nearest texel, from their largest
+    level.
     """
     y, x = np.mgrid[: SIZE[0], : SIZE[1]] + 0.5
     scale = 2 * np.tan(HFOV / 2) / SIZE[1]

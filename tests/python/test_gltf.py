@@ -18,6 +18,7 @@ from numpy.typing import NDArray
 
 from wiw import scenes
 from wiw.errors import FileError
+from wiw.physics import read_surface
 from wiw.render import Renderer
 from wiw.scenes import basis
 
@@ -342,11 +343,30 @@ def test_one_image_serves_several_samplers(tmp_path: Path) -> None:
     glb.textured(1)
     unlit(glb)
     for i in (0, 1):
-        glb.node(glb.mesh(TWO, i, POSITION=np.float32([0.5, 1, 1]) * SQUARE + np.float32([0.5 * i, 0, 0]), TEXCOORD_0=uv))
+        glb.node(
+            glb.mesh(TWO, i, POSITION=np.float32([0.5, 1, 1]) * SQUARE + np.float32([0.5 * i, 0, 0]), TEXCOORD_0=uv)
+        )
     entries = {"samplers": [{"wrapS": 33071, "wrapT": 33071}], "textures": [{"source": 0}, {"source": 0, "sampler": 0}]}
     scene = load(save(glb, tmp_path / "a.glb", **entries))
     left, right = SQUARE * (0.5, 1, 1), SQUARE * (0.5, 1, 1) + (0.5, 0, 0)
     assert_as_cast(scene, Part(left, TWO, uv, image), Part(right, TWO, uv, image, ("clamp", "clamp")))
+
+
+def test_links_of_robots_may_be_gltf(tmp_path: Path) -> None:
+    glb = compressed_bumps()
+    glb.nodes[0] |= {"scale": [2, 2, 2], "translation": [0, 0, 1]}
+    glb.materials[0] = {"pbrMetallicRoughness": {"baseColorFactor": [1, 0, 0, 1]}}
+    file = save_compressed(glb, tmp_path / "link.glb")
+    surface = read_surface(file, scale=(1, 1, -1))
+    vertices, triangles, _ = bumps()
+    expected = (2 * vertices + [0, 0, 1]) * [1, 1, -1]
+    np.testing.assert_allclose(np.sort(surface["positions"], axis=0), np.sort(expected, axis=0), atol=1e-5)
+    assert len(surface["triangles"]) == len(triangles)
+    np.testing.assert_allclose(surface["normals"], np.tile([0, 0, -1], (len(vertices), 1)), atol=0.02)
+    np.testing.assert_allclose(surface["colors"], np.tile([1, 0, 0, 1], (len(vertices), 1)))
+    file.write_bytes(file.read_bytes()[:300])
+    with pytest.raises(FileError, match=r"truncated file\) \(mesh of link 'hand'\)"):
+        read_surface(file, link="hand")
 
 
 @pytest.mark.parametrize(("mode", "corners"), [(5, [0, 1, 3, 2]), (6, [0, 1, 2, 3])])

@@ -142,6 +142,10 @@ std::vector<std::uint8_t> GltfData::load(const Json& buffer, std::size_t index) 
     return *std::move(bytes);
   }
   const std::filesystem::path file = path_.parent_path() / decode_percent_escapes(uri);
+  std::error_code ignored;
+  if (!std::filesystem::is_regular_file(file, ignored)) {
+    throw FileError(path_.string(), "lacks its buffer " + file.string() + ": no such file");
+  }
   check_limit(file.string(), "bytes", size_of_file(file), options_.limits.file_bytes, "file_bytes");
   if (options_.trace) options_.trace->read.push_back(file);
   return read_file(file);
