@@ -83,15 +83,15 @@ class PrimitiveReader {
 
   /// Values of an attribute, which has one of these numbers of components.
   GltfValues values(const std::string& attribute, std::size_t components, std::size_t or_components = 0) {
-    const Json& accessor =
-        document_["accessors"].items().at(primitive_["attributes"][attribute].whole().value_or(SIZE_MAX));
+    const std::size_t index = primitive_["attributes"][attribute].whole().value_or(SIZE_MAX);
+    const Json& accessor = document_["accessors"].items().at(index);
     const std::size_t found = components_of(accessor["type"].text());
     if (found != components && found != or_components) {
       fail("has " + attribute + " of " + std::to_string(found) + " components");
     }
     const Json& compression = primitive_["extensions"]["KHR_draco_mesh_compression"];
     const auto id = compression["attributes"][attribute].whole();
-    if (!draco_ || !id) return data_.read(*primitive_["attributes"][attribute].whole());
+    if (!draco_ || !id) return data_.read(index);
     if (draco_->vertex_count() != accessor["count"].whole()) {
       fail("has " + std::to_string(draco_->vertex_count()) + " vertices, but should have " +
            std::to_string(accessor["count"].whole().value_or(0)));

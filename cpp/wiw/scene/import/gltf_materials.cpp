@@ -75,6 +75,7 @@ class GltfTextures {
       images.try_emplace(reference.name, reference);
     }
     std::vector<ImageReference> references;
+    references.reserve(images.size());
     for (auto& [name, reference] : images) references.push_back(std::move(reference));
     source_.load(references, scene);
   }
