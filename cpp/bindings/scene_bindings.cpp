@@ -7,6 +7,7 @@
 #include <algorithm>
 #include <cstring>
 #include <limits>
+#include <new>
 #include <optional>
 
 #include "arrays.hpp"
@@ -130,11 +131,29 @@ void set_limits(const py::dict& values, wiw::scene::ImportLimits& limits) {
   }
 }
 
+/// Calls `decode` with the bytes of an image; called from any thread, without the interpreter's lock.
+wiw::scene::BasisDecoder basis_decoder(const py::function& decode) {
+  return [&decode](std::span<const std::uint8_t> bytes) {
+    const py::gil_scoped_acquire lock;
+    try {
+      const auto image = decode(py::bytes(reinterpret_cast<const char*>(bytes.data()), bytes.size()))
+                             .cast<wiw::bindings::Array<std::uint8_t>>();
+      wiw::bindings::expect_shape(image, {-1, -1, 4}, "a decoded image uint8 [H, W, 4]");
+      const wiw::Size size{static_cast<int>(image.shape(0)), static_cast<int>(image.shape(1))};
+      std::vector<std::uint8_t> rgba(image.data(), image.data() + image.size());
+      return wiw::scene::Texture{"", size, std::move(rgba), {}};
+    } catch (py::error_already_set& error) {
+      if (error.matches(PyExc_MemoryError)) throw std::bad_alloc();
+      throw wiw::Error("cannot be decoded as Basis Universal (" + std::string(py::str(error.value())) + ")");
+    }
+  };
+}
+
 using Paths = std::vector<std::filesystem::path>;
 
 py::tuple import_scene(const std::filesystem::path& path, const std::optional<std::string>& up,
                        const std::optional<float> ceiling, const py::dict& limits, const Paths& texture_folders,
-                       const Paths& model_folders) {
+                       const Paths& model_folders, const std::optional<py::function>& decode_basis) {
   wiw::scene::ImportTrace trace;
   wiw::scene::ImportOptions options;
   options.up = up_from_text(up);
@@ -142,6 +161,7 @@ py::tuple import_scene(const std::filesystem::path& path, const std::optional<st
   options.texture_folders = texture_folders;
   options.model_folders = model_folders;
   options.trace = &trace;
+  if (decode_basis) options.decode_basis = basis_decoder(*decode_basis);
   set_limits(limits, options.limits);
   ScenePtr scene;
   {
@@ -222,10 +242,12 @@ void bind_apartment(py::module_& module);
 void bind_scene(py::module_& module) {
   bind_scene_class(module);
   bind_apartment(module);
-  module.def("import_scene", &import_scene, py::arg("path"), py::kw_only(), py::arg("up") = py::none(),
-             py::arg("ceiling") = py::none(), py::arg("limits") = py::dict(), py::arg("texture_folders") = Paths{},
-             py::arg("model_folders") = Paths{},
-             "Reads a mesh or a Gazebo world. Returns (scene, files read, files looked for but absent).");
+  module.def(
+      "import_scene", &import_scene, py::arg("path"), py::kw_only(), py::arg("up") = py::none(),
+      py::arg("ceiling") = py::none(), py::arg("limits") = py::dict(), py::arg("texture_folders") = Paths{},
+      py::arg("model_folders") = Paths{}, py::arg("decode_basis") = py::none(),
+      "Reads a mesh or a Gazebo world. `decode_basis` makes uint8 [H, W, 4] of a `.basis` or KTX2 image; without "
+      "it such textures are missing. Returns (scene, files read, files looked for but absent).");
   module.def("read_ply_surface", &read_ply_surface, py::arg("path"), py::arg("label"), py::kw_only(),
              py::arg("limits") = py::dict(),
              "Reads a binary PLY file with a property `label` of faces. Returns vertices float32 [V, 3] in the file's "

@@ -54,6 +54,17 @@ find_library(WIW_URDFDOM urdfdom_model)
 find_library(WIW_CONSOLE_BRIDGE console_bridge)
 wiw_require(liburdfdom-dev WIW_URDFDOM_INCLUDE WIW_URDFDOM WIW_CONSOLE_BRIDGE)
 
+# Compressed meshes and images of glTF.
+find_path(WIW_DRACO_INCLUDE draco/compression/decode.h)
+find_library(WIW_DRACO draco)
+wiw_require(libdraco-dev WIW_DRACO_INCLUDE WIW_DRACO)
+find_path(WIW_MESHOPTIMIZER_INCLUDE meshoptimizer.h)
+find_library(WIW_MESHOPTIMIZER meshoptimizer)
+wiw_require(libmeshoptimizer-dev WIW_MESHOPTIMIZER_INCLUDE WIW_MESHOPTIMIZER)
+find_path(WIW_WEBP_INCLUDE webp/decode.h)
+find_library(WIW_WEBP webp)
+wiw_require(libwebp-dev WIW_WEBP_INCLUDE WIW_WEBP)
+
 # Headers only: stb_image decodes PNG and JPEG; EGL is opened at run time, so nothing links it.
 find_path(WIW_STB_INCLUDE stb/stb_image.h)
 wiw_require(libstb-dev WIW_STB_INCLUDE)
@@ -90,3 +101,10 @@ target_link_libraries(wiw_bullet INTERFACE ${WIW_BulletDynamics} ${WIW_BulletCol
 add_library(wiw_urdfdom INTERFACE)
 target_include_directories(wiw_urdfdom SYSTEM INTERFACE ${WIW_URDFDOM_INCLUDE})
 target_link_libraries(wiw_urdfdom INTERFACE ${WIW_URDFDOM} ${WIW_CONSOLE_BRIDGE})
+
+foreach(library draco meshoptimizer webp)
+  string(TOUPPER WIW_${library} found)
+  add_library(wiw_${library} INTERFACE)
+  target_include_directories(wiw_${library} SYSTEM INTERFACE ${${found}_INCLUDE})
+  target_link_libraries(wiw_${library} INTERFACE ${${found}})
+endforeach()

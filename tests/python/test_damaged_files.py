@@ -7,18 +7,21 @@ import json
 import os
 import random
 import resource
+import signal
 import struct
 import subprocess
 import sys
 import time
 from collections.abc import Callable
 from pathlib import Path
+from tempfile import TemporaryDirectory
 from typing import Any
 
 import cv2
 import numpy as np
 import pytest
 from glb import Glb
+from test_gltf import DATA, DRACO, compressed_bumps, draco_glb, save, save_compressed
 
 import wiw
 from wiw import process_limits, scenes
@@ -418,6 +421,19 @@ read_mutations({kind!r}, Path({folder!r}), {begin}, {count})
 """
 
 
+MOST_MEMORY = 2 << 30
+MOST_SECONDS = 10
+
+
+def compressed_glb(kind: str) -> bytes:
+    """The bytes of a file with a compressed mesh."""
+    with TemporaryDirectory() as folder:
+        file = Path(folder) / "m.glb"
+        if kind == "draco glb":
+            return save(draco_glb((DATA / "bumps.drc").read_bytes()), file, **DRACO).read_bytes()
+        return save_compressed(compressed_bumps(), file).read_bytes()
+
+
 def subject(kind: str) -> tuple[str, bytes, Callable[[Path], Any]]:
     """A file's name, its content, and what reads it."""
     formats: dict[str, tuple[str, bytes]] = {
@@ -431,6 +447,8 @@ def subject(kind: str) -> tuple[str, bytes, Callable[[Path], Any]]:
         "mtl": ("m.mtl", MTL),
         "png": ("part.png", png()),
     }
+    if kind in ("draco glb", "meshopt glb"):
+        formats[kind] = ("m.glb", compressed_glb(kind))
     if kind in formats:
         name, content = formats[kind]
         read = name if name not in ("m.mtl", "part.png") else "m.obj"
@@ -443,44 +461,50 @@ def subject(kind: str) -> tuple[str, bytes, Callable[[Path], Any]]:
 
 
 def read_mutations(kind: str, folder: Path, begin: int, count: int) -> None:
-    """Read mutations of a file and print what came of each; a crash ends this process, and the count says where."""
+    """Read mutations of a file and print what came of each; a crash ends this process, and the count says where.
+
+    So does a file that takes too long; one that takes too much memory is refused.
+    """
     name, content, read = subject(kind)
+    resource.setrlimit(resource.RLIMIT_DATA, (MOST_MEMORY, MOST_MEMORY))
     for index in range(begin, count):
         (folder / name).write_bytes(mutate(content, random.Random(f"{kind} {index}")))
         print(index, end=" ", flush=True)
+        signal.alarm(MOST_SECONDS)
         try:
             read(folder)
             print("read")
         except Error as error:
             print(type(error).__name__, str(error).isprintable() or repr(str(error)))
+        except MemoryError:
+            print("FileError", "out of memory")  # as the importing process says it
 
 
-@pytest.mark.parametrize(
-    "kind",
-    [
-        "ply",
-        "binary ply",
-        "glb",
-        "posed glb",
-        "dae",
-        "sdf",
-        "obj",
-        "mtl",
-        "png",
-        "urdf",
-        "link ply",
-        "link obj",
-        "link mtl",
-    ],
-)
+KINDS = (
+    "ply", "binary ply", "glb", "posed glb", "meshopt glb", "draco glb", "dae", "sdf", "obj", "mtl", "png", "urdf",
+    "link ply", "link obj", "link mtl",
+)  # fmt: skip
+
+
+@pytest.mark.parametrize("kind", KINDS)
 def test_mutations_end_in_errors_of_wiw(tmp_path: Path, kind: str) -> None:
     """Readers may crash on what nobody foresaw, in a process of their own; any other error than wiw's is a defect."""
+    check_mutations(tmp_path, kind, 60)
+
+
+@pytest.mark.nightly
+@pytest.mark.parametrize("kind", [*KINDS, "link glb", "link dae", "link binary ply"])
+def test_many_mutations_end_in_errors_of_wiw(tmp_path: Path, kind: str) -> None:
+    check_mutations(tmp_path, kind, 20_000)
+
+
+def check_mutations(tmp_path: Path, kind: str, count: int) -> None:
     for name, content in (("m.obj", OBJ), ("m.mtl", MTL), ("part.png", png())):
         write(tmp_path / name, content)
     name, content, read = subject(kind)
     write(tmp_path / name, content)
     read(tmp_path)  # whole files are read
-    count, begin, crashes, refused = 60, 0, 0, 0
+    begin, crashes, refused = 0, [], 0
     while begin < count:
         code = MUTATIONS.format(
             here=str(Path(__file__).parent), kind=kind, folder=str(tmp_path), begin=begin, count=count
@@ -492,7 +516,7 @@ def test_mutations_end_in_errors_of_wiw(tmp_path: Path, kind: str) -> None:
         if done.returncode == 0:
             break
         assert done.returncode < 0, f"{lines[-1:]}: {done.stderr[-2000:]}"  # a traceback would be 1
-        crashes += 1
         begin = int(lines[-1].split()[0]) + 1
+        crashes.append((begin - 1, signal.Signals(-done.returncode).name))
     assert refused > 0 or kind in ("mtl", "png", "link mtl")  # a scene may do without its pictures
-    assert crashes == 0
+    assert crashes == []

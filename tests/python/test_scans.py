@@ -25,7 +25,8 @@ from wiw.datasets.worlds import navmesh_file, world
 from wiw.errors import ArgumentError, DependencyError, FileError
 from wiw.nav import NavMesh
 from wiw.render import Renderer
-from wiw.scenes.scans import basis, hm3d, labels
+from wiw.scenes import basis
+from wiw.scenes.scans import hm3d, labels
 from wiw.scenes.scans.scene_dataset import words_of
 from wiw.tasks.ar import AR
 

@@ -71,6 +71,28 @@ scene::ScenePtr make_furnished() {
   return builder.build();
 }
 
+scene::ScenePtr make_tiled() {
+  using scene::Wrap;
+  SceneBuilder builder;
+  const Eigen::Vector2f begin(-1.3f, -0.6f);
+  constexpr Wrap kWraps[] = {Wrap::kRepeat, Wrap::kClamp, Wrap::kMirror};
+  for (int i = 0; i < 6; ++i) {
+    const bool nearest = i >= 3;
+    const Size size = nearest ? Size{4, 5} : Size{24, 31};
+    const std::int32_t texture = builder.add_texture(size, blobs(size, nearest ? 0 : 255));
+    builder.scene.textures.back().sampling = {kWraps[i % 3], kWraps[(i + 1) % 3], nearest};
+    const std::int32_t material =
+        builder.add_material({"tile", Eigen::Vector4f::Ones(), texture, i == 5 ? 0.5f : -1.f, true});
+    scene::Mesh mesh =
+        make_quad({-1.5f + static_cast<float>(i % 3), static_cast<float>(i / 3), -1}, {0.95f, 0, 0}, {0, 0.95f, -0.3f});
+    std::vector<Eigen::Vector2f> uv(mesh.uv.begin(), mesh.uv.end());
+    for (Eigen::Vector2f& each : uv) each = begin + 3.7f * each;
+    mesh.uv = uv;
+    builder.add_instance(with(mesh, material));
+  }
+  return builder.build();
+}
+
 scene::ScenePtr make_sunny() {
   scene::Scene scene = *make_furnished();
   scene.sun = {Eigen::Vector3f(0.48f, 0.8f, 0.36f), 0.7f, 0.5f};

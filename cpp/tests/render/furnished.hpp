@@ -14,4 +14,7 @@ constexpr std::uint32_t kFurnishedSphere = 6;
 /// The same under a sun that reaches the floor over the open ceiling.
 scene::ScenePtr make_sunny();
 
+/// Six tiles whose textures go on beyond their edges, each in another way; three are not interpolated from near by.
+scene::ScenePtr make_tiled();
+
 }  // namespace wiw::testing

@@ -144,6 +144,20 @@ TEST_CASE("gpu: pictures agree with the ray caster's") {
   }
 }
 
+TEST_CASE("gpu: textures go on beyond their edges as the ray caster's do") {
+  if (!available()) return;
+  const scene::ScenePtr scene = make_tiled();
+  const auto renderer = gpu(scene, 1);
+  const auto reference = make_cpu_renderer(scene, {});
+  for (const double distance : {0.4, 6.0}) {
+    const Camera camera{Projection::kPerspective, {120, 160}, distance < 1 ? 2.0 : 0.5};
+    const Pose pose = look({0, 0.9, distance}, 0.0, 0.0);
+    const Difference difference = compare(draw(*reference, pose, camera), draw(*renderer, pose, camera));
+    CHECK(difference.ids < 0.002);
+    CHECK(difference.color < 0.5);
+  }
+}
+
 TEST_CASE("gpu: shadows of the sun agree with the ray caster's, also after a move") {
   if (!available()) return;
   const std::uint32_t id = kFurnishedSphere;

@@ -28,7 +28,15 @@ bool meets(const Eigen::AlignedBox3d& box, const Vector& origin, const Vector& r
   return to_min.min(to_max).maxCoeff() <= to_min.max(to_max).minCoeff();
 }
 
-int wrap(int i, int size, bool repeat) { return repeat ? ((i % size) + size) % size : std::clamp(i, 0, size - 1); }
+/// The texel that stands at place `i` of an endless row.
+int wrap(int i, int size, scene::Wrap mode) {
+  if (mode == scene::Wrap::kClamp) return std::clamp(i, 0, size - 1);
+  const int period = mode == scene::Wrap::kMirror ? 2 * size : size;
+  const int inside = ((i % period) + period) % period;
+  return inside < size ? inside : period - 1 - inside;
+}
+
+constexpr scene::Sampling kLightmap{scene::Wrap::kClamp, scene::Wrap::kClamp, false};
 
 }  // namespace
 
@@ -74,27 +82,37 @@ std::vector<Reference::Hit> Reference::all_hits(const Vector& origin, const Vect
   return hits;
 }
 
-Eigen::Vector4d Reference::bilinear(std::int32_t number, int level, const Eigen::Vector2d& uv, bool repeat) const {
+Eigen::Vector4d Reference::sample(std::int32_t number, int level, const Eigen::Vector2d& uv,
+                                  const scene::Sampling& sampling) const {
   const auto index = static_cast<std::size_t>(number);
   const scene::Texture& texture = scene_.textures[index];
   const Size size = level == 0 ? texture.size : mips_[index][static_cast<std::size_t>(level) - 1].size;
   const std::uint8_t* texels =
       level == 0 ? texture.rgba.data() : mips_[index][static_cast<std::size_t>(level) - 1].rgba.data();
-  const Eigen::Vector2d inside = repeat ? uv - uv.array().floor().matrix() : uv.cwiseMax(0.0).cwiseMin(1.0).eval();
-  const double x = inside.x() * size.width - 0.5;
-  const double y = inside.y() * size.height - 0.5;
+  double x = uv.x() * size.width - 0.5;
+  double y = uv.y() * size.height - 0.5;
+  if (sampling.nearest) {
+    x = std::round(x);
+    y = std::round(y);
+  }
   const double x0 = std::floor(x);
   const double y0 = std::floor(y);
   Eigen::Vector4d sum = Eigen::Vector4d::Zero();
   for (const int dy : {0, 1}) {
     for (const int dx : {0, 1}) {
-      const int row = wrap(static_cast<int>(y0) + dy, size.height, repeat);
-      const int column = wrap(static_cast<int>(x0) + dx, size.width, repeat);
+      const int row = wrap(static_cast<int>(y0) + dy, size.height, sampling.v);
+      const int column = wrap(static_cast<int>(x0) + dx, size.width, sampling.u);
       const double weight = (dx ? x - x0 : 1 - x + x0) * (dy ? y - y0 : 1 - y + y0);
       for (int c = 0; c < 4; ++c) sum[c] += weight * texels[4 * (row * size.width + column) + c] / 255.0;
     }
   }
   return sum;
+}
+
+bool Reference::is_between_texels(std::int32_t number, const Eigen::Vector2d& uv) const {
+  const scene::Texture& texture = scene_.textures[static_cast<std::size_t>(number)];
+  const Eigen::Vector2d texels = uv.cwiseProduct(Eigen::Vector2d(texture.size.width, texture.size.height));
+  return texture.sampling.nearest && (texels - texels.array().round().matrix()).cwiseAbs().minCoeff() < 1e-3;
 }
 
 bool Reference::is_hole(const Hit& hit, bool& doubtful) const {
@@ -103,7 +121,10 @@ bool Reference::is_hole(const Hit& hit, bool& doubtful) const {
   if (material.alpha_cutoff < 0) return false;
   double alpha = material.base_color[3];
   if (material.texture != scene::kNone && !hit.mesh->uv.empty()) {
-    alpha *= bilinear(material.texture, 0, blend(hit.mesh->uv, *hit.mesh, hit.triangle, hit.b1, hit.b2), true)[3];
+    const Eigen::Vector2d uv = blend(hit.mesh->uv, *hit.mesh, hit.triangle, hit.b1, hit.b2);
+    const scene::Sampling sampling = scene_.textures[static_cast<std::size_t>(material.texture)].sampling;
+    alpha *= sample(material.texture, 0, uv, sampling)[3];
+    doubtful = doubtful || is_between_texels(material.texture, uv);
   }
   doubtful = doubtful || std::abs(alpha - material.alpha_cutoff) < 1e-3;
   return alpha < material.alpha_cutoff;
@@ -195,12 +216,16 @@ Vector Reference::shade(const Hit& hit, const Vector& ray, double spread, bool& 
   if (material.texture != scene::kNone && !mesh.uv.empty()) {
     const auto last = static_cast<double>(mips_[static_cast<std::size_t>(material.texture)].size());
     const double lod = std::clamp(level(hit, ray, spread), 0.0, last);
+    scene::Sampling sampling = scene_.textures[static_cast<std::size_t>(material.texture)].sampling;
+    const bool magnified = lod <= 0;
+    sampling.nearest = sampling.nearest && magnified;
     const Eigen::Vector2d uv = blend(mesh.uv, mesh, hit.triangle, hit.b1, hit.b2);
     const int fine = static_cast<int>(lod);
     const int coarse = std::min(fine + 1, static_cast<int>(last));
-    const Eigen::Vector4d texel = (1 - lod + fine) * bilinear(material.texture, fine, uv, true) +
-                                  (lod - fine) * bilinear(material.texture, coarse, uv, true);
+    const Eigen::Vector4d texel = (1 - lod + fine) * sample(material.texture, fine, uv, sampling) +
+                                  (lod - fine) * sample(material.texture, coarse, uv, sampling);
     color = color.cwiseProduct(texel.head<3>());
+    doubtful = doubtful || is_between_texels(material.texture, uv);
   }
   if (!mesh.colors.empty()) {
     color = color.cwiseProduct(blend(mesh.colors, mesh, hit.triangle, hit.b1, hit.b2).head<3>()) / 255.0;
@@ -208,7 +233,7 @@ Vector Reference::shade(const Hit& hit, const Vector& ray, double spread, bool& 
   if (!material.emissive) {
     if (mesh.lightmap != scene::kNone) {
       const Eigen::Vector2d uv = blend(mesh.lightmap_uv, mesh, hit.triangle, hit.b1, hit.b2);
-      color = 2.0 * color.cwiseProduct(bilinear(mesh.lightmap, 0, uv, false).head<3>());
+      color = 2.0 * color.cwiseProduct(sample(mesh.lightmap, 0, uv, kLightmap).head<3>());
     } else {
       color *= light(hit, ray, doubtful);
     }

@@ -37,7 +37,9 @@ class Reference {
   [[nodiscard]] double level(const Hit& hit, const Eigen::Vector3d& ray, double spread) const;
   [[nodiscard]] double light(const Hit& hit, const Eigen::Vector3d& ray, bool& doubtful) const;
   [[nodiscard]] bool sees_sun(const Eigen::Vector3d& point, const Eigen::Vector3d& direction, bool& doubtful) const;
-  [[nodiscard]] Eigen::Vector4d bilinear(std::int32_t texture, int level, const Eigen::Vector2d& uv, bool repeat) const;
+  [[nodiscard]] Eigen::Vector4d sample(std::int32_t texture, int level, const Eigen::Vector2d& uv,
+                                       const scene::Sampling& sampling) const;
+  [[nodiscard]] bool is_between_texels(std::int32_t texture, const Eigen::Vector2d& uv) const;
 
   const scene::Scene& scene_;
   std::vector<std::vector<render::MipLevel>> mips_;  // by texture

@@ -70,6 +70,15 @@ TEST_CASE("every kind of surface is shaded as the slow twin shades it, with ever
   }
 }
 
+TEST_CASE("textures go on beyond their edges as their sampling says, from near by and from afar") {
+  const scene::ScenePtr scene = make_tiled();
+  const Reference reference(*scene);
+  for (const double distance : {0.4, 6.0}) {
+    const Camera camera{Projection::kPerspective, {37, 49}, distance < 1 ? 2.0 : 0.5};
+    check_all_sets(scene, reference, look({0, 0.9, distance}, 0.0, 0.0), camera);
+  }
+}
+
 TEST_CASE("light and shadows of a sun are those of the slow twin, from high, and grazing") {
   for (const Eigen::Vector3f& direction : {Eigen::Vector3f(0.48f, 0.8f, 0.36f), Eigen::Vector3f(0.8f, 0.08f, 0.6f)}) {
     scene::Scene changed = *make_sunny();

@@ -179,7 +179,7 @@ TEST_CASE("damaged, cut and foreign caches are refused") {
   std::string older = whole;
   older[8] = 0;
   CHECK_THROWS_WITH_AS(wiw::scene::map_scene_cache(folder.write("older", older)),
-                       doctest::Contains("has version 0, expected 4"), wiw::FileError);
+                       doctest::Contains("has version 0, expected 5"), wiw::FileError);
   for (std::size_t length = 1; length < whole.size(); length += 7) {
     CHECK_THROWS_AS(wiw::scene::map_scene_cache(folder.write("cut", whole.substr(0, length))), wiw::FileError);
   }

@@ -164,7 +164,8 @@ TEST_CASE("the share of the surface without its texture is that of what is drawn
   const Folder folder;
   CHECK(missing_texture_share(*load_mesh(folder.write("a.glb", sample_glb()))) == 0);
   GlbParts basis;
-  basis.texture = R"({"extensions":{"GOOGLE_texture_basis":{"source":0}}})";
+  basis.texture = R"({"extensions":{"KHR_texture_basisu":{"source":0}}})";
+  basis.image = sample_ktx2();
   const auto undecoded = load_mesh(folder.write("b.glb", sample_glb(basis)));
   CHECK(missing_texture_share(*undecoded) == 1);
   CHECK(undecoded->materials[0].base_color[0] < 0.8f);  // grey, not white

@@ -30,6 +30,13 @@ inline std::string sample_bmp(std::uint32_t claimed = 2) {
   return bytes;
 }
 
+/// A KTX2 image of 2 x 2 pixels as far as its sizes; what follows takes a decoder.
+inline std::string sample_ktx2() {
+  std::string bytes = "\xABKTX 20\xBB\r\n\x1A\n";
+  for (const std::uint32_t word : {0U, 1U, 2U, 2U, 0U, 0U, 1U, 1U, 1U}) append(bytes, word);
+  return bytes;
+}
+
 inline const std::vector<float>& square_positions() {
   static const std::vector<float> positions{0, 0, 0, 1, 0, 0, 1, 1, 0, 0, 1, 0};
   return positions;

@@ -12,6 +12,7 @@
 
 #include "wiw/core/error.hpp"
 #include "wiw/physics/shape.hpp"
+#include "wiw/scene/import.hpp"
 #include "wiw/scene/import/collada_check.hpp"
 #include "wiw/scene/import/file.hpp"
 #include "wiw/scene/import/obj_check.hpp"
@@ -61,18 +62,36 @@ class MeshFile {
     return *scene;
   }
 
+  /// The file as a scene in its own axes: glTF is not assimp's to read.
+  [[nodiscard]] scene::ScenePtr read_gltf() const {
+    scene::ImportOptions options;
+    options.up = scene::Up::kY;
+    options.limits.file_bytes = kMaxBytes;
+    scene::ScenePtr scene;
+    name_link([&] { scene = scene::load_mesh(path_, options); });
+    return scene;
+  }
+
  private:
-  /// What assimp does not survive.
-  void check_damage() const {
+  /// Adds the link to an error of `read`'s.
+  template <class Read>
+  void name_link(const Read& read) const {
     try {
-      if (extension_of(path_) == ".ply") scene::check_ply(path_);
-      if (extension_of(path_) == ".dae") scene::check_collada(path_);
-      if (extension_of(path_) == ".obj") scene::check_obj(path_);
+      read();
     } catch (const FileError& damage) {
       const std::string text = damage.what();
       const std::string own = path_.string() + ": ";
       throw error(text.starts_with(own) ? text.substr(own.size()) : text);
     }
+  }
+
+  /// What assimp does not survive.
+  void check_damage() const {
+    name_link([&] {
+      if (extension_of(path_) == ".ply") scene::check_ply(path_);
+      if (extension_of(path_) == ".dae") scene::check_collada(path_);
+      if (extension_of(path_) == ".obj") scene::check_obj(path_);
+    });
   }
 
   /// The steps that follow take for granted that every face has corners and that every corner is a vertex.
@@ -106,6 +125,8 @@ class MeshFile {
 /// STL knows faces alone: its normals would show every curve as facets.
 bool is_stl(const fs::path& path) { return extension_of(path) == ".stl"; }
 
+bool is_gltf(const fs::path& path) { return extension_of(path) == ".glb" || extension_of(path) == ".gltf"; }
+
 Eigen::Vector3f to_eigen(const aiVector3D& v) { return {v.x, v.y, v.z}; }
 
 /// Of the file's own materials; those that assimp makes up have no say.
@@ -132,6 +153,44 @@ void append(const aiScene& scene, const aiMesh& mesh, const Eigen::Vector3f& sca
   }
 }
 
+/// The mean of the normals of a vertex's triangles, weighted by their area.
+std::vector<Eigen::Vector3f> smooth_normals(const scene::Mesh& mesh) {
+  std::vector<Eigen::Vector3f> normals(mesh.positions.size(), Eigen::Vector3f::Zero());
+  for (const scene::Triangle& t : mesh.triangles) {
+    const Eigen::Vector3f& corner = mesh.positions[t[0]];
+    const Eigen::Vector3f normal = (mesh.positions[t[1]] - corner).cross(mesh.positions[t[2]] - corner);
+    for (int k = 0; k < 3; ++k) normals[t[k]] += normal;
+  }
+  return normals;
+}
+
+void append(const scene::Scene& scene, const scene::Mesh& mesh, const Eigen::Affine3f& placement,
+            const Eigen::Vector3f& scale, VisualMesh& surface) {
+  const auto first = static_cast<std::uint32_t>(surface.positions.size());
+  const std::vector<Eigen::Vector3f> normals =
+      mesh.normals.empty() ? smooth_normals(mesh)
+                           : std::vector<Eigen::Vector3f>(mesh.normals.begin(), mesh.normals.end());
+  const Eigen::Vector4f color = mesh.material == scene::kNone
+                                    ? Eigen::Vector4f(Eigen::Vector4f::Zero())
+                                    : scene.materials[static_cast<std::size_t>(mesh.material)].base_color;
+  for (std::size_t v = 0; v < mesh.positions.size(); ++v) {
+    surface.positions.emplace_back(scale.cwiseProduct(placement * mesh.positions[v]));
+    surface.normals.push_back((placement.linear() * normals[v]).cwiseQuotient(scale).normalized());
+    const auto own = [&] { return (mesh.colors[v].cast<float>() / 255.f).eval(); };
+    surface.colors.push_back(mesh.colors.empty() ? color : own());
+    surface.colors.back()[3] = mesh.colors.empty() && mesh.material == scene::kNone ? 0.f : 1.f;
+  }
+  for (const scene::Triangle& t : mesh.triangles) surface.triangles.emplace_back(first + t.array());
+}
+
+/// Calls `use` with every mesh of a scene and its placement.
+template <class Use>
+void for_each_mesh(const scene::Scene& scene, const Use& use) {
+  for (const scene::Instance& instance : scene.instances) {
+    for (const std::uint32_t mesh : instance.meshes) use(scene.meshes[mesh], instance.T_world_instance);
+  }
+}
+
 void check_scale(const MeshFile& file, const Eigen::Vector3d& scale) {
   if (!scale.allFinite() || (scale.array() == 0).any()) throw file.error("expected finite factors of scale, none zero");
 }
@@ -139,6 +198,14 @@ void check_scale(const MeshFile& file, const Eigen::Vector3d& scale) {
 VisualMesh read_surface(const fs::path& path, const Eigen::Vector3d& scale, const std::string& link) {
   MeshFile file(path, link);
   check_scale(file, scale);
+  if (is_gltf(path)) {
+    const scene::ScenePtr scene = file.read_gltf();
+    VisualMesh surface;
+    for_each_mesh(*scene, [&](const scene::Mesh& mesh, const Eigen::Affine3f& placement) {
+      append(*scene, mesh, placement, scale.cast<float>(), surface);
+    });
+    return surface;
+  }
   unsigned steps =
       aiProcess_Triangulate | aiProcess_SortByPType | aiProcess_GenSmoothNormals | aiProcess_JoinIdenticalVertices;
   if (is_stl(path)) steps |= aiProcess_RemoveComponent;
@@ -149,17 +216,27 @@ VisualMesh read_surface(const fs::path& path, const Eigen::Vector3d& scale, cons
   return surface;
 }
 
+std::vector<Eigen::Vector3d> read_points(MeshFile& file, const fs::path& path) {
+  std::vector<Eigen::Vector3d> points;
+  if (is_gltf(path)) {
+    for_each_mesh(*file.read_gltf(), [&](const scene::Mesh& mesh, const Eigen::Affine3f& placement) {
+      for (const Eigen::Vector3f& position : mesh.positions) points.push_back((placement * position).cast<double>());
+    });
+    return points;
+  }
+  const aiScene& scene = file.read(aiProcess_JoinIdenticalVertices);
+  for (unsigned m = 0; m < scene.mNumMeshes; ++m) {
+    const aiMesh& mesh = *scene.mMeshes[m];
+    for (unsigned v = 0; v < mesh.mNumVertices; ++v) points.push_back(to_eigen(mesh.mVertices[v]).cast<double>());
+  }
+  return points;
+}
+
 std::vector<Eigen::Vector3d> read_hull(const fs::path& path, const Eigen::Vector3d& scale, const std::string& link) {
   MeshFile file(path, link);
   check_scale(file, scale);
-  const aiScene& scene = file.read(aiProcess_JoinIdenticalVertices);
-  std::vector<Eigen::Vector3d> points;
-  for (unsigned m = 0; m < scene.mNumMeshes; ++m) {
-    const aiMesh& mesh = *scene.mMeshes[m];
-    for (unsigned v = 0; v < mesh.mNumVertices; ++v) {
-      points.emplace_back(scale.cwiseProduct(to_eigen(mesh.mVertices[v]).cast<double>()));
-    }
-  }
+  std::vector<Eigen::Vector3d> points = read_points(file, path);
+  for (Eigen::Vector3d& point : points) point = scale.cwiseProduct(point);
   const HullMesh hull = hull_mesh(points);
   if (hull.vertices.empty()) throw file.error("its vertices span no volume");
   return hull.vertices;

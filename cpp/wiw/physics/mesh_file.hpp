@@ -19,7 +19,7 @@ struct VisualMesh {
 /// What a mesh file shows, as `hull_of_file` reads it. Materials give their diffuse colour; textures are not read.
 VisualMesh surface_of_file(const std::filesystem::path& path, const Eigen::Vector3d& scale, const std::string& link);
 
-/// Vertices of the convex hull of a mesh file (STL, OBJ, DAE, ...) in the file's axes, node transforms applied.
+/// Vertices of the convex hull of a mesh file (STL, OBJ, DAE, glTF, ...) in the file's axes, node transforms applied.
 /// Throws FileError, which names file and `link`, for a file that is missing, damaged or flat.
 std::vector<Eigen::Vector3d> hull_of_file(const std::filesystem::path& path, const Eigen::Vector3d& scale,
                                           const std::string& link);

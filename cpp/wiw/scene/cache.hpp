@@ -9,7 +9,7 @@
 namespace wiw::scene {
 
 /// Changes whenever the layout of a cache file does; files of another version are refused.
-inline constexpr std::uint32_t kSceneCacheVersion = 4;
+inline constexpr std::uint32_t kSceneCacheVersion = 5;
 
 /// Writes a scene, textures included, to one file: a header, the arrays at 64-byte boundaries as they lie in memory,
 /// and a table that says which is which. Geometry carries checksums, and so do header and table together. The file

@@ -15,7 +15,7 @@
 #include "wiw/scene/import/collada_check.hpp"
 #include "wiw/scene/import/extent.hpp"
 #include "wiw/scene/import/file.hpp"
-#include "wiw/scene/import/gltf_check.hpp"
+#include "wiw/scene/import/gltf_scene.hpp"
 #include "wiw/scene/import/guarded_io.hpp"
 #include "wiw/scene/import/obj_check.hpp"
 #include "wiw/scene/import/ply_header.hpp"
@@ -24,7 +24,7 @@
 namespace wiw::scene {
 namespace {
 
-constexpr int kImporterVersion = 4;  // raise it whenever the same file and options give another scene
+constexpr int kImporterVersion = 5;  // raise it whenever the same file and options give another scene
 
 /// What comes after indexes arrays by what the file says.
 void check_indices(const aiScene& file, const std::filesystem::path& path) {
@@ -45,12 +45,11 @@ void check_indices(const aiScene& file, const std::filesystem::path& path) {
   }
 }
 
-const aiScene& parse(Assimp::Importer& importer, const std::filesystem::path& path, const ImportOptions& options,
-                     FileContents contents) {
+const aiScene& parse(Assimp::Importer& importer, const std::filesystem::path& path, const ImportOptions& options) {
   // The file's axes are turned by UpAxis alone, so that one rule holds for every format.
   importer.SetPropertyBool(AI_CONFIG_IMPORT_COLLADA_IGNORE_UP_DIRECTION, true);
   importer.SetPropertyBool(AI_CONFIG_IMPORT_COLLADA_USE_COLLADA_NAMES, true);
-  importer.SetIOHandler(new GuardedIo(options, std::move(contents)));  // NOLINT(*-owning-memory): the importer owns it
+  importer.SetIOHandler(new GuardedIo(options));  // NOLINT(*-owning-memory): the importer owns it
   const aiScene* file = importer.ReadFile(path.string(), 0);
   if (!file) throw FileError(path.string(), "cannot be read: " + std::string(importer.GetErrorString()));
   if ((file->mFlags & AI_SCENE_FLAGS_INCOMPLETE) || !file->mRootNode) {
@@ -62,34 +61,34 @@ const aiScene& parse(Assimp::Importer& importer, const std::filesystem::path& pa
   return *file;
 }
 
-/// Refuses damage that assimp does not survive, and warns of what it drops in silence. Returns what assimp is to read
-/// in place of the files, and what it will not find.
-GltfRewrite check_content(const FileContext& context, Scene& scene) {
-  check_signature(context.path, context.format);
+/// Refuses damage that assimp does not survive.
+void check_content(const FileContext& context) {
   if (context.format == MeshFormat::kPly) check_ply(context.path);
   if (context.format == MeshFormat::kDae) check_collada(context.path);
   if (context.format == MeshFormat::kObj) check_obj(context.path);
-  if (context.format != MeshFormat::kGlb && context.format != MeshFormat::kGltf) return {};
-  GltfRewrite rewrite = check_gltf(context.path, context.format, context.options);
-  for (std::string& warning : rewrite.warnings) scene.warnings.push_back(std::move(warning));
-  return rewrite;
+}
+
+void convert_with_assimp(const FileContext& context, const UpAxis& up, Scene& scene) {
+  check_content(context);
+  const auto importer = make_importer();
+  const aiScene& file = parse(*importer, context.path, context.options);
+  convert_materials(file, context, scene);
+  convert_nodes(file, context, up, scene);
 }
 
 ScenePtr import_mesh(const std::filesystem::path& path, const ImportOptions& options) {
   const MeshFormat format = mesh_format_of(path);
   check_limit(path.string(), "bytes", size_of_file(path), options.limits.file_bytes, "file_bytes");
-  const FileContext context{path, format, options};
-  auto scene = std::make_shared<Scene>();
-  GltfRewrite rewrite = check_content(context, *scene);
-
-  const auto importer = make_importer();
-  const aiScene& file = parse(*importer, path, options, std::move(rewrite.files));
+  check_signature(path, format);
   const UpAxis up = up_axis_of(path, format, options.up);
+  auto scene = std::make_shared<Scene>();
   scene->name = path.stem().string();
   scene->attributes["up"] = up.text();
-  convert_materials(file, context, *scene);
-  mark_untextured(rewrite.untextured, *scene);
-  convert_nodes(file, context, up, *scene);
+  if (format == MeshFormat::kGlb || format == MeshFormat::kGltf) {
+    convert_gltf(path, format, options, up, *scene);
+  } else {
+    convert_with_assimp({path, format, options}, up, *scene);
+  }
   if (scene->instances.empty()) throw FileError(path.string(), "holds no triangles");
   check_imported(*scene, path);
   if (options.ceiling_height) add_ceiling(*scene, *options.ceiling_height);

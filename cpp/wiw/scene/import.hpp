@@ -6,6 +6,7 @@
 #include <string>
 #include <vector>
 
+#include "wiw/scene/import/image_file.hpp"
 #include "wiw/scene/import/limits.hpp"
 #include "wiw/scene/scene.hpp"
 
@@ -32,13 +33,14 @@ struct ImportOptions {
   std::vector<std::filesystem::path> texture_folders;  // searched by base name after the file's own folders
   std::vector<std::filesystem::path> model_folders;    // SDF: searched for model://NAME before the world's own folders
   ImportTrace* trace = nullptr;
+  BasisDecoder decode_basis;             // empty: images in Basis Universal are missing
   SharedCount* texture_bytes = nullptr;  // counted together by the files of one scene
 };
 
 /// Reads GLB, glTF, OBJ, PLY or DAE into a Y-up scene in metres: one instance per node that carries meshes, placed by
-/// a rigid transform (scale and shear are applied to the vertices). A texture that cannot be found or decoded is
-/// named in `Scene::warnings` and drawn in a neutral colour. Throws FileError for a missing, damaged, unsupported or
-/// too large file.
+/// a rigid transform (scale and shear are applied to the vertices). glTF is read here, the others by assimp. A texture
+/// that cannot be found or decoded is named in `Scene::warnings` and drawn in a neutral colour. Throws FileError for a
+/// missing, damaged, unsupported or too large file.
 ScenePtr load_mesh(const std::filesystem::path& path, const ImportOptions& options = {});
 
 }  // namespace wiw::scene

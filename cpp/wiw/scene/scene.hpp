@@ -2,6 +2,7 @@
 #pragma once
 
 #include <Eigen/Geometry>
+#include <compare>
 #include <cstdint>
 #include <map>
 #include <memory>
@@ -15,11 +16,23 @@
 
 namespace wiw::scene {
 
+/// How a texture goes on beyond its edges.
+enum class Wrap : std::uint8_t { kRepeat, kClamp, kMirror };
+
+struct Sampling {
+  Wrap u = Wrap::kRepeat;
+  Wrap v = Wrap::kRepeat;
+  bool nearest = false;  // seen from near by, a texel is a square of one colour; mip levels are smooth all the same
+  auto operator<=>(const Sampling&) const = default;
+};
+
 /// 8-bit RGBA image, display-encoded (sRGB-like), row 0 at the top; texture coordinate v = 0 is the TOP edge.
+/// Lightmaps are clamped and smooth, whatever `sampling` says.
 struct Texture {
   std::string name;
   Size size;
   Buffer<std::uint8_t> rgba;  // [height, width, 4]
+  Sampling sampling;
 };
 
 constexpr std::int32_t kNone = -1;

@@ -35,15 +35,18 @@ struct alignas(64) TriangleDetail {
 };
 static_assert(sizeof(TriangleDetail) == 4 * kRecordWords);
 
-/// Mip levels in one array. Each level has a border of one texel on every side (repeated or clamped), so that a
-/// bilinear footprint is always two pairs of neighbouring texels and needs no wrap arithmetic.
+enum class Edge : std::int32_t { kRepeat, kClamp, kMirror };
+
+/// Mip levels in one array. Each level has a border of one texel on every side (repeated, or that of the edge), so that
+/// a bilinear footprint is always two pairs of neighbouring texels and needs no wrap arithmetic.
 struct SampledTexture {
   const std::uint32_t* texels;  // RGBA bytes
   float width[kLevelSlots];
   float height[kLevelSlots];
   std::int32_t offset[kLevelSlots];  // of the bordered level's first texel
   float last_level;
-  bool repeat;  // else clamped to the edge
+  Edge edge_u, edge_v;
+  bool nearest;  // level 0 is not interpolated
 };
 
 struct ShadingSurface {

@@ -38,11 +38,21 @@ inline RgbLanes mix(const RgbLanes& a, const RgbLanes& b, Floats weight) {
   return {a.r + weight * (b.r - a.r), a.g + weight * (b.g - a.g), a.b + weight * (b.b - a.b)};
 }
 
-/// Bilinear colour in [0, 255] at (u, v) in [0, 1] of each lane's level.
+/// The middle of the texel that `x` lies in, counted with the border; at the far edge it is the last one's.
+inline Floats texel_middle(Floats x, Floats size) {
+  const Floats texel = __builtin_convertvector(__builtin_convertvector(x, Ints), Floats);
+  return (texel < size - 1.f ? texel : size - 1.f) + 1.f;
+}
+
+/// Bilinear colour in [0, 255] at (u, v) in [0, 1] of each lane's level; in lanes `square`, that of the texel alone.
 inline RgbLanes sample_level(const SampledTexture& texture, Floats u, Floats v, Floats width, Floats height,
-                             Ints offset) {
-  const Floats x = u * width + 0.5f;  // texel centres at half integers, plus the border of one texel
-  const Floats y = v * height + 0.5f;
+                             Ints offset, Ints square = Ints{}) {
+  Floats x = u * width + 0.5f;  // texel centres at half integers, plus the border of one texel
+  Floats y = v * height + 0.5f;
+  if (texture.nearest) {
+    x = square ? texel_middle(u * width, width) : x;
+    y = square ? texel_middle(v * height, height) : y;
+  }
   const Ints column = __builtin_convertvector(x, Ints);
   const Ints row = __builtin_convertvector(y, Ints);
   const Floats right = x - __builtin_convertvector(column, Floats);
@@ -56,8 +66,13 @@ inline RgbLanes sample_level(const SampledTexture& texture, Floats u, Floats v, 
              below);
 }
 
-inline Floats wrap(const SampledTexture& texture, Floats coordinate) {
-  return saturate(texture.repeat ? coordinate - floor_of(coordinate) : coordinate);
+inline Floats wrap(Edge edge, Floats coordinate) {
+  if (edge == Edge::kRepeat) coordinate -= floor_of(coordinate);
+  if (edge == Edge::kMirror) {
+    coordinate -= 2.f * floor_of(0.5f * coordinate);
+    coordinate = coordinate > 1.f ? 2.f - coordinate : coordinate;
+  }
+  return saturate(coordinate);
 }
 
 inline RgbLanes normalised(const RgbLanes& bytes) {
@@ -66,19 +81,19 @@ inline RgbLanes normalised(const RgbLanes& bytes) {
 
 /// Level 0 alone.
 inline RgbLanes sample_bilinear(const SampledTexture& texture, Floats u, Floats v) {
-  return normalised(sample_level(texture, wrap(texture, u), wrap(texture, v), Floats{} + texture.width[0],
+  return normalised(sample_level(texture, wrap(texture.edge_u, u), wrap(texture.edge_v, v), Floats{} + texture.width[0],
                                  Floats{} + texture.height[0], Ints{} + texture.offset[0]));
 }
 
 inline RgbLanes sample_trilinear(const SampledTexture& texture, Floats u, Floats v, Floats lod) {
-  u = wrap(texture, u);
-  v = wrap(texture, v);
+  u = wrap(texture.edge_u, u);
+  v = wrap(texture.edge_v, v);
   lod = lod > 0.f ? lod : Floats{};
   lod = lod < texture.last_level ? lod : Floats{} + texture.last_level;
   const Ints fine = __builtin_convertvector(lod, Ints);
   const Floats blend = lod - __builtin_convertvector(fine, Floats);
   RgbLanes color = sample_level(texture, u, v, look_up(texture.width, fine), look_up(texture.height, fine),
-                                look_up(texture.offset, fine));
+                                look_up(texture.offset, fine), lod <= 0.f);
   if (mask_bits(blend > 0.f) != 0) {
     const Ints coarse = blend > 0.f ? fine + 1 : fine;
     color = mix(color,

@@ -149,15 +149,15 @@ std::uint32_t ShadingScene::add_surface(const scene::Mesh& mesh) {
   surface.alpha_cutoff = material.alpha_cutoff;
   surface.emissive = material.emissive;
   surface.vertex_colors = !mesh.colors.empty();
-  if (textured) surface.texture = add_texture(material.texture, TextureStore::Edge::kRepeat);
-  if (lightmap != scene::kNone) surface.lightmap = add_texture(lightmap, TextureStore::Edge::kClamp);
+  if (textured) surface.texture = add_texture(material.texture, TextureStore::Use::kSurface);
+  if (lightmap != scene::kNone) surface.lightmap = add_texture(lightmap, TextureStore::Use::kLightmap);
   surfaces_.push_back(surface);
   return entry->second;
 }
 
-const SampledTexture* ShadingScene::add_texture(std::int32_t index, TextureStore::Edge edge) {
-  auto& store = textures_[{index, edge}];
-  if (!store) store = std::make_unique<TextureStore>(scene_.textures[static_cast<std::size_t>(index)], edge);
+const SampledTexture* ShadingScene::add_texture(std::int32_t index, TextureStore::Use use) {
+  auto& store = textures_[{index, use}];
+  if (!store) store = std::make_unique<TextureStore>(scene_.textures[static_cast<std::size_t>(index)], use);
   return &store->sampled();
 }
 

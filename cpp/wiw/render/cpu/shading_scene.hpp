@@ -40,14 +40,14 @@ class ShadingScene {
  private:
   using SurfaceKey = std::tuple<std::int32_t, std::int32_t, bool, bool>;  // material, lightmap, textured, colours
   std::uint32_t add_surface(const scene::Mesh& mesh);
-  const SampledTexture* add_texture(std::int32_t index, TextureStore::Edge edge);
+  const SampledTexture* add_texture(std::int32_t index, TextureStore::Use use);
   void add_parts();
   void place_texels(std::size_t part, const Eigen::Matrix3f& linear);
   void place_bulges(std::size_t part, const Eigen::Matrix3f& linear);
 
   const scene::Scene& scene_;
   Sunlight sun_{};  // if the scene has one
-  std::map<std::pair<std::int32_t, TextureStore::Edge>, std::unique_ptr<TextureStore>> textures_;
+  std::map<std::pair<std::int32_t, TextureStore::Use>, std::unique_ptr<TextureStore>> textures_;
   std::map<SurfaceKey, std::uint32_t> surface_numbers_;
   std::vector<ShadingSurface> surfaces_;
   std::vector<InstanceMesh> parts_;

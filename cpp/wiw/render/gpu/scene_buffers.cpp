@@ -31,14 +31,25 @@ void upload_level(const Gl& gl, int level, Size size, const std::uint8_t* rgba) 
   gl.TexImage2D(GL_TEXTURE_2D, level, GL_RGBA8, size.width, size.height, 0, GL_RGBA, GL_UNSIGNED_BYTE, rgba);
 }
 
-GlSampler make_sampler(const Gl& gl, GLint minify, GLint wrap) {
+GLint wrap_mode(scene::Wrap wrap) {
+  switch (wrap) {
+    case scene::Wrap::kRepeat: return GL_REPEAT;
+    case scene::Wrap::kClamp: return GL_CLAMP_TO_EDGE;
+    case scene::Wrap::kMirror: return GL_MIRRORED_REPEAT;
+  }
+  return GL_REPEAT;
+}
+
+GlSampler make_sampler(const Gl& gl, GLint minify, const scene::Sampling& sampling) {
   GlSampler sampler(gl);
   gl.SamplerParameteri(sampler.id(), GL_TEXTURE_MIN_FILTER, minify);
-  gl.SamplerParameteri(sampler.id(), GL_TEXTURE_MAG_FILTER, GL_LINEAR);
-  gl.SamplerParameteri(sampler.id(), GL_TEXTURE_WRAP_S, wrap);
-  gl.SamplerParameteri(sampler.id(), GL_TEXTURE_WRAP_T, wrap);
+  gl.SamplerParameteri(sampler.id(), GL_TEXTURE_MAG_FILTER, sampling.nearest ? GL_NEAREST : GL_LINEAR);
+  gl.SamplerParameteri(sampler.id(), GL_TEXTURE_WRAP_S, wrap_mode(sampling.u));
+  gl.SamplerParameteri(sampler.id(), GL_TEXTURE_WRAP_T, wrap_mode(sampling.v));
   return sampler;
 }
+
+constexpr scene::Sampling kLightmapSampling{scene::Wrap::kClamp, scene::Wrap::kClamp, false};
 
 }  // namespace
 
@@ -49,8 +60,7 @@ SceneBuffers::SceneBuffers(GlContext& context, const scene::Scene& scene, const 
       indices_(gl_),
       instances_(gl_, context.info().uniform_alignment),
       materials_(gl_, context.info().uniform_alignment),
-      texture_sampler_(make_sampler(gl_, GL_LINEAR_MIPMAP_LINEAR, GL_REPEAT)),
-      lightmap_sampler_(make_sampler(gl_, GL_LINEAR, GL_CLAMP_TO_EDGE)) {
+      lightmap_sampler_(make_sampler(gl_, GL_LINEAR, kLightmapSampling)) {
   upload_geometry(geometry);
   std::vector<InstanceBlock> instances;
   instances.reserve(scene.instances.size());
@@ -110,6 +120,9 @@ void SceneBuffers::upload_textures(const scene::Scene& scene, int max_size) {
       for (const MipLevel& mip : build_mips(texture)) upload_level(gl_, ++level, mip.size, mip.rgba.data());
     }
     gl_.TexParameteri(GL_TEXTURE_2D, GL_TEXTURE_MAX_LEVEL, level);
+    auto& sampler = samplers_[texture.sampling];
+    if (!sampler) sampler = make_sampler(gl_, GL_LINEAR_MIPMAP_LINEAR, texture.sampling);
+    sampler_of_texture_.push_back(sampler->id());
   }
 }
 
@@ -124,7 +137,7 @@ void SceneBuffers::bind_material(std::int32_t index) const {
 void SceneBuffers::bind_texture(std::int32_t index) const {
   gl_.ActiveTexture(GL_TEXTURE0 + kColorUnit);
   gl_.BindTexture(GL_TEXTURE_2D, textures_[static_cast<std::size_t>(index)].id());
-  gl_.BindSampler(kColorUnit, texture_sampler_.id());
+  gl_.BindSampler(kColorUnit, sampler_of_texture_[static_cast<std::size_t>(index)]);
 }
 
 void SceneBuffers::bind_lightmap(std::int32_t index) const {

@@ -1,6 +1,8 @@
 // SPDX-License-Identifier: Apache-2.0
 #pragma once
 
+#include <map>
+#include <optional>
 #include <vector>
 
 #include "wiw/render/gpu/geometry.hpp"
@@ -48,7 +50,8 @@ class SceneBuffers {
   UniformSlots<InstanceBlock> instances_;
   UniformSlots<MaterialBlock> materials_;  // slot 0: no material
   std::vector<GlTexture> textures_;
-  GlSampler texture_sampler_;
+  std::map<scene::Sampling, std::optional<GlSampler>> samplers_;
+  std::vector<GLuint> sampler_of_texture_;
   GlSampler lightmap_sampler_;
 };
 

@@ -17,6 +17,9 @@ void fields_of(Archive& archive, T& texture)
   archive.value(texture.size.height);
   archive.value(texture.size.width);
   archive.texels(texture.rgba);
+  archive.value(texture.sampling.u);
+  archive.value(texture.sampling.v);
+  archive.value(texture.sampling.nearest);
 }
 
 template <class Archive, class T>

@@ -2,7 +2,6 @@
 #pragma once
 
 #include <filesystem>
-#include <span>
 
 #include "wiw/scene/import.hpp"
 #include "wiw/scene/import/mesh_format.hpp"
@@ -21,9 +20,6 @@ struct FileContext {
 
 /// Materials and textures of the file, in its order.
 void convert_materials(const aiScene& file, const FileContext& context, Scene& scene);
-
-/// Notes that the textures of these materials cannot be had, and draws them in a neutral colour.
-void mark_untextured(std::span<const std::size_t> materials, Scene& scene);
 
 /// One mesh in the file's own axes; triangles without area are dropped. Throws FileError for damage.
 Mesh convert_mesh(const aiScene& file, unsigned index, const FileContext& context, Scene& scene);

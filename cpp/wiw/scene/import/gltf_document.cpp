@@ -57,10 +57,6 @@ GltfDocument glb_document(const std::filesystem::path& path) {
   return {parsed(bytes, path.string()), body, next + kChunkHeader};
 }
 
-void append_word(std::vector<std::uint8_t>& bytes, std::size_t value) {
-  for (unsigned i = 0; i < 4; ++i) bytes.push_back(static_cast<std::uint8_t>(value >> (8 * i)));
-}
-
 }  // namespace
 
 GltfDocument read_gltf_document(const std::filesystem::path& path, MeshFormat format) {
@@ -68,18 +64,9 @@ GltfDocument read_gltf_document(const std::filesystem::path& path, MeshFormat fo
   return {parsed(read_file(path), path.string()), std::nullopt};
 }
 
-std::vector<std::uint8_t> glb_bytes(const Json& root, const std::vector<std::uint8_t>& body) {
-  std::string text = root.write();
-  text.resize((text.size() + 3) / 4 * 4, ' ');
-  std::vector<std::uint8_t> bytes{'g', 'l', 'T', 'F'};
-  append_word(bytes, 2);
-  append_word(bytes, 12 + 2 * kChunkHeader + text.size() + body.size());
-  append_word(bytes, text.size());
-  append_word(bytes, kJsonChunk);
-  bytes.insert(bytes.end(), text.begin(), text.end());
-  append_word(bytes, body.size());
-  append_word(bytes, kBinaryChunk);
-  bytes.insert(bytes.end(), body.begin(), body.end());
+std::vector<std::uint8_t> read_gltf_body(const GltfDocument& document, const std::filesystem::path& path) {
+  auto bytes = read_file(path, document.body_offset + document.body.value_or(0));
+  bytes.erase(bytes.begin(), bytes.begin() + static_cast<std::ptrdiff_t>(document.body_offset));
   return bytes;
 }
 

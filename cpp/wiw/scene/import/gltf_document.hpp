@@ -22,7 +22,7 @@ struct GltfDocument {
 /// Throws FileError for chunks that do not fit the file's length and for JSON that is none.
 GltfDocument read_gltf_document(const std::filesystem::path& path, MeshFormat format);
 
-/// A GLB file of these two chunks.
-std::vector<std::uint8_t> glb_bytes(const Json& root, const std::vector<std::uint8_t>& body);
+/// A GLB's binary chunk.
+std::vector<std::uint8_t> read_gltf_body(const GltfDocument& document, const std::filesystem::path& path);
 
 }  // namespace wiw::scene

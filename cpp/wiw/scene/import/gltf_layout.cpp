@@ -67,21 +67,41 @@ class GltfLayoutChecker {
     return table[index];
   }
 
-  std::uint64_t buffer_bytes(const Json& view) const {
-    const Json& buffer = entry(document_["buffers"].items(), view, "buffer");
+  std::uint64_t buffer_bytes(const Json& part) const {
+    const Json& buffer = entry(document_["buffers"].items(), part, "buffer");
     const bool is_body = body_ && &buffer == document_["buffers"].items().data() && buffer["uri"].is_null();
     return is_body ? *body_ : number(buffer, "byteLength", 0);
   }
 
-  void add_view(const Json& view) {
-    const std::uint64_t available = buffer_bytes(view);
-    const std::uint64_t offset = number(view, "byteOffset", 0);
-    const BufferView added{number(view, "byteLength", 0), number(view, "byteStride", 0)};
-    if (offset > available || added.bytes > available - offset) {
-      fail("bufferView " + std::to_string(views_.size()) + " has " + std::to_string(added.bytes) + " bytes from " +
+  /// The bytes of a part of a buffer, which must have them.
+  std::uint64_t checked_bytes(const Json& part) const {
+    const std::uint64_t available = buffer_bytes(part);
+    const std::uint64_t offset = number(part, "byteOffset", 0);
+    const std::uint64_t bytes = number(part, "byteLength", 0);
+    if (offset > available || bytes > available - offset) {
+      fail("bufferView " + std::to_string(views_.size()) + " has " + std::to_string(bytes) + " bytes from " +
            std::to_string(offset) + ", but its buffer " + std::to_string(available));
     }
-    views_.push_back(added);
+    return bytes;
+  }
+
+  /// Of a compressed view, the extension says where the bytes are; its own buffer need not exist.
+  void add_view(const Json& view) {
+    const Json& compression = view["extensions"]["EXT_meshopt_compression"];
+    const std::uint64_t stride = number(view, "byteStride", 0);
+    if (compression.is_null()) {
+      views_.push_back({checked_bytes(view), stride});
+      return;
+    }
+    checked_bytes(compression);
+    const std::uint64_t bytes = number(view, "byteLength", 0);
+    const std::uint64_t count = number(compression, "count", 0);
+    const std::uint64_t element = number(compression, "byteStride", 0);
+    if (count != 0 && (bytes % count != 0 || bytes / count != element)) {
+      fail("bufferView " + std::to_string(views_.size()) + " has " + std::to_string(bytes) + " bytes, but " +
+           std::to_string(count) + " compressed elements of " + std::to_string(element));
+    }
+    views_.push_back({count == 0 ? 0 : bytes, stride});
   }
 
   std::uint64_t type_bytes(const Json& object, std::string_view type) const {
@@ -136,6 +156,8 @@ class GltfLayoutChecker {
     check_same_count(primitive["attributes"], vertices);
     for (const Json& target : primitive["targets"].items()) check_same_count(target, vertices);
     if (!primitive["indices"].is_null()) entry(counts_, primitive, "indices");
+    const Json& compression = primitive["extensions"]["KHR_draco_mesh_compression"];
+    if (!compression.is_null()) entry(views_, compression, "bufferView");
   }
 
   void check_skin(const Json& skin) const {

@@ -1,6 +1,7 @@
 // SPDX-License-Identifier: Apache-2.0
 #include "wiw/scene/import/gltf_nodes.hpp"
 
+#include <Eigen/Geometry>
 #include <algorithm>
 #include <cstdint>
 #include <vector>
@@ -11,6 +12,17 @@ namespace wiw::scene {
 namespace {
 
 constexpr int kDeepest = 1000;  // nodes in nodes
+
+/// The `size` numbers of a node's member; `otherwise` where there are none.
+template <int size>
+Eigen::Matrix<float, size, 1> numbers(const Json& list, const Eigen::Matrix<float, size, 1>& otherwise) {
+  Eigen::Matrix<float, size, 1> values = otherwise;
+  const Json::Array& items = list.items();
+  if (items.size() != size) return values;
+  for (int i = 0; i < size; ++i)
+    values[i] = static_cast<float>(items[static_cast<std::size_t>(i)].number().value_or(0));
+  return values;
+}
 
 class NodeCounter {
  public:
@@ -66,6 +78,27 @@ void check_vertices(const Json& document, const ImportLimits& limits, const std:
 }
 
 }  // namespace
+
+Eigen::Matrix4f compose_transform(const float* translation, const float* rotation, const float* scale) {
+  Eigen::Affine3f transform = Eigen::Affine3f::Identity();
+  if (translation != nullptr) transform.translate(Eigen::Map<const Eigen::Vector3f>(translation));
+  if (rotation != nullptr) transform.rotate(Eigen::Map<const Eigen::Quaternionf>(rotation).normalized());  // xyzw
+  if (scale != nullptr) transform.scale(Eigen::Map<const Eigen::Vector3f>(scale));
+  return transform.matrix();
+}
+
+Eigen::Matrix4f local_transform(const Json& node) {
+  if (!node["matrix"].is_null()) {
+    const Eigen::Matrix4f identity = Eigen::Matrix4f::Identity();
+    const Eigen::Matrix<float, 16, 1> columns =
+        numbers<16>(node["matrix"], Eigen::Map<const Eigen::Matrix<float, 16, 1>>(identity.data()));
+    return Eigen::Map<const Eigen::Matrix4f>(columns.data());
+  }
+  const Eigen::Vector3f translation = numbers<3>(node["translation"], Eigen::Vector3f::Zero());
+  const Eigen::Vector4f rotation = numbers<4>(node["rotation"], {0, 0, 0, 1});
+  const Eigen::Vector3f scale = numbers<3>(node["scale"], Eigen::Vector3f::Ones());
+  return compose_transform(translation.data(), rotation.data(), scale.data());
+}
 
 std::size_t vertex_limit(const ImportLimits& limits) {
   constexpr std::size_t kAlways = 1'000'000;  // less is no harm

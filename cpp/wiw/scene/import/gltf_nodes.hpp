@@ -1,6 +1,7 @@
 // SPDX-License-Identifier: Apache-2.0
 #pragma once
 
+#include <Eigen/Core>
 #include <string>
 
 #include "wiw/scene/import/json.hpp"
@@ -12,6 +13,12 @@ namespace wiw::scene {
 /// each of them, and so are vertices that several meshes share. Throws FileError for nodes among their own descendants,
 /// nested too deep or more than the limit, and for more vertices than the limit of triangles can have.
 void check_gltf_size(const Json& document, const ImportLimits& limits, const std::string& path);
+
+/// Of a translation, a rotation (a quaternion xyzw, of any length) and a scale; null pointers stand for none.
+Eigen::Matrix4f compose_transform(const float* translation, const float* rotation, const float* scale);
+
+/// A node's own transform, from its matrix or from translation, rotation and scale.
+Eigen::Matrix4f local_transform(const Json& node);
 
 /// Most vertices and corners together that a file within the limit of triangles has use for.
 std::size_t vertex_limit(const ImportLimits& limits);

@@ -1,43 +1,17 @@
 // SPDX-License-Identifier: Apache-2.0
 #include "wiw/scene/import/gltf_skin.hpp"
 
-#include <Eigen/Geometry>
 #include <Eigen/LU>
 #include <algorithm>
 
 #include "wiw/core/error.hpp"
+#include "wiw/scene/import/gltf_nodes.hpp"
 
 namespace wiw::scene {
 namespace {
 
 [[noreturn]] void fail(const std::filesystem::path& path, const std::string& cause) {
   throw FileError(path.string(), cause + " (damaged file)");
-}
-
-/// The `size` numbers of a node's member; `otherwise` where there are none.
-template <int size>
-Eigen::Matrix<float, size, 1> numbers(const Json& list, const Eigen::Matrix<float, size, 1>& otherwise) {
-  Eigen::Matrix<float, size, 1> values = otherwise;
-  const Json::Array& items = list.items();
-  if (items.size() != size) return values;
-  for (int i = 0; i < size; ++i)
-    values[i] = static_cast<float>(items[static_cast<std::size_t>(i)].number().value_or(0));
-  return values;
-}
-
-Eigen::Matrix4f local_transform(const Json& node) {
-  if (!node["matrix"].is_null()) {
-    const Eigen::Matrix4f identity = Eigen::Matrix4f::Identity();
-    const Eigen::Matrix<float, 16, 1> columns =
-        numbers<16>(node["matrix"], Eigen::Map<const Eigen::Matrix<float, 16, 1>>(identity.data()));
-    return Eigen::Map<const Eigen::Matrix4f>(columns.data());
-  }
-  const Eigen::Vector4f q = numbers<4>(node["rotation"], {0, 0, 0, 1});
-  Eigen::Affine3f transform = Eigen::Affine3f::Identity();
-  transform.translate(numbers<3>(node["translation"], Eigen::Vector3f::Zero()));
-  transform.rotate(Eigen::Quaternionf(q[3], q[0], q[1], q[2]).normalized());
-  transform.scale(numbers<3>(node["scale"], Eigen::Vector3f::Ones()));
-  return transform.matrix();
 }
 
 std::vector<std::size_t> parents_of(const Json::Array& nodes) {

@@ -48,13 +48,7 @@ class GuardedStream : public Assimp::IOStream {
 
 }  // namespace
 
-const std::vector<std::uint8_t>* GuardedIo::content_of(const char* file) const {
-  const auto found = contents_.find(std::filesystem::path(file).filename().string());
-  return found == contents_.end() ? nullptr : &found->second;
-}
-
 bool GuardedIo::Exists(const char* file) const {
-  if (content_of(file)) return true;
   std::error_code ignored;
   const bool there = std::filesystem::is_regular_file(file, ignored);
   if (!there && options_.trace) options_.trace->absent.emplace_back(file);
@@ -63,11 +57,7 @@ bool GuardedIo::Exists(const char* file) const {
 
 Assimp::IOStream* GuardedIo::Open(const char* file, const char* mode) {
   if (std::string_view(mode).find_first_of("wa+") != std::string_view::npos || !Exists(file)) return nullptr;
-  std::error_code ignored;
-  if (options_.trace && std::filesystem::is_regular_file(file, ignored)) options_.trace->read.emplace_back(file);
-  if (const auto* content = content_of(file)) {
-    return new GuardedStream(*content);  // NOLINT(cppcoreguidelines-owning-memory): assimp closes it
-  }
+  if (options_.trace) options_.trace->read.emplace_back(file);
   check_limit(file, "bytes", size_of_file(file), options_.limits.file_bytes, "file_bytes");
   return new GuardedStream(read_file(file));  // NOLINT(cppcoreguidelines-owning-memory): assimp closes it
 }

@@ -32,23 +32,6 @@ void append_utf8(std::string& text, std::uint32_t code) {
   }
 }
 
-void write_string(std::string_view string, std::string& text) {
-  constexpr std::string_view kHex = "0123456789abcdef";
-  text += '"';
-  for (const char c : string) {
-    const auto code = static_cast<unsigned char>(c);
-    if (c == '"' || c == '\\') text += '\\';
-    if (code >= 0x20) {
-      text += c;
-    } else {
-      text += "\\u00";
-      text += kHex[code >> 4U];
-      text += kHex[code & 0xFU];
-    }
-  }
-  text += '"';
-}
-
 class Parser {
  public:
   explicit Parser(std::string_view text) : text_(text.substr(0, text.find('\0'))) {}
@@ -220,67 +203,6 @@ std::optional<double> Json::number() const {
 bool Json::is_true() const {
   const auto* truth = std::get_if<bool>(&value_);
   return truth && *truth;
-}
-
-Json Json::from(double number) {
-  std::array<char, 32> text{};
-  const auto [end, error] = std::to_chars(text.data(), text.data() + text.size(), number);
-  return Json(Value(OtherNumber{std::string(text.data(), end)}));
-}
-
-Json Json::from(std::initializer_list<double> numbers) {
-  Array items;
-  for (const double number : numbers) items.push_back(from(number));
-  return Json(Value(std::move(items)));
-}
-
-Json& Json::member(std::string_view name) {
-  if (!is_object()) value_ = Object{};
-  auto& all = std::get<Object>(value_);
-  const auto found = std::ranges::find(all, name, &Object::value_type::first);
-  return found == all.end() ? all.emplace_back(std::string(name), Json()).second : found->second;
-}
-
-Json::Array& Json::list() {
-  if (!std::holds_alternative<Array>(value_)) value_ = Array{};
-  return std::get<Array>(value_);
-}
-
-void Json::erase(std::string_view name) {
-  if (auto* all = std::get_if<Object>(&value_))
-    std::erase_if(*all, [&](const auto& each) { return each.first == name; });
-}
-
-std::string Json::write() const {
-  std::string text;
-  write_to(text);
-  return text;
-}
-
-void Json::write_to(std::string& text) const {
-  if (is_null()) text += "null";
-  if (const auto* truth = std::get_if<bool>(&value_)) text += *truth ? "true" : "false";
-  if (const auto* whole = std::get_if<std::uint64_t>(&value_)) text += std::to_string(*whole);
-  if (const auto* other = std::get_if<OtherNumber>(&value_)) text += other->text;
-  if (const auto* string = std::get_if<std::string>(&value_)) write_string(*string, text);
-  if (const auto* array = std::get_if<Array>(&value_)) {
-    text += '[';
-    for (const Json& item : *array) {
-      if (&item != array->data()) text += ',';
-      item.write_to(text);
-    }
-    text += ']';
-  }
-  if (const auto* object = std::get_if<Object>(&value_)) {
-    text += '{';
-    for (const auto& each : *object) {
-      if (&each != object->data()) text += ',';
-      write_string(each.first, text);
-      text += ':';
-      each.second.write_to(text);
-    }
-    text += '}';
-  }
 }
 
 std::string_view Json::text() const {

@@ -3,7 +3,6 @@
 
 #include <cstddef>
 #include <cstdint>
-#include <initializer_list>
 #include <optional>
 #include <string>
 #include <string_view>
@@ -13,7 +12,7 @@
 
 namespace wiw::scene {
 
-/// A JSON value (RFC 8259), read, changed and written. Whole numbers from 0 to 2^64 - 1 are kept as such, others as
+/// A JSON value (RFC 8259). Whole numbers from 0 to 2^64 - 1 are kept as such, others as
 /// they stand in the text.
 class Json {
  public:
@@ -26,11 +25,6 @@ class Json {
 
   Json() = default;
   explicit Json(Value value) : value_(std::move(value)) {}
-  static Json from(std::size_t whole) { return Json(Value(std::uint64_t{whole})); }
-  static Json from(double number);
-  static Json from(std::string_view text) { return Json(Value(std::string(text))); }
-  /// An array of numbers.
-  static Json from(std::initializer_list<double> numbers);
 
   /// Throws Error naming the byte at which `text` stops being JSON. A zero byte ends the text.
   static Json parse(std::string_view text);
@@ -50,16 +44,7 @@ class Json {
   /// Empty unless this is a string.
   [[nodiscard]] std::string_view text() const;
 
-  /// The member of that name, made where there is none; what is no object becomes one.
-  Json& member(std::string_view name);
-  /// The elements; what is no array becomes one.
-  Array& list();
-  void erase(std::string_view name);
-  [[nodiscard]] std::string write() const;
-
  private:
-  void write_to(std::string& text) const;
-
   Value value_;
 };
 

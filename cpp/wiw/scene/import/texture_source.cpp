@@ -1,8 +1,6 @@
 // SPDX-License-Identifier: Apache-2.0
 #include "wiw/scene/import/texture_source.hpp"
 
-#include <assimp/scene.h>
-
 #include <algorithm>
 #include <array>
 #include <cctype>
@@ -17,11 +15,11 @@
 namespace wiw::scene {
 namespace fs = std::filesystem;
 
-/// Where a reference leads: to an image of the mesh file or a file of its own.
 struct TextureSource::Found {
-  const aiTexture* embedded = nullptr;
-  fs::path file;
-  Size size;            // by the image's header
+  const ImageReference* image = nullptr;
+  fs::path file;  // where it is not embedded
+  Size size;      // by the image's header
+  bool needs_basis = false;
   std::string problem;  // empty: usable
   ImportTrace trace;
 };
@@ -50,37 +48,15 @@ std::string as_path(std::string reference) {
 
 std::string size_text(Size size) { return std::to_string(size.width) + " x " + std::to_string(size.height); }
 
-bool is_raw(const aiTexture& image) { return image.mHeight > 0; }
-
-std::span<const std::uint8_t> encoded(const aiTexture& image) {
-  return {reinterpret_cast<const std::uint8_t*>(image.pcData), image.mWidth};
-}
-
-Size raw_size(const aiTexture& image) { return {static_cast<int>(image.mHeight), static_cast<int>(image.mWidth)}; }
-
-Texture raw_texture(const aiTexture& image, std::string name) {
-  const Size size = raw_size(image);
-  std::vector<std::uint8_t> rgba(4 * size.pixels());
-  for (std::size_t i = 0; i < size.pixels(); ++i) {
-    const aiTexel& texel = image.pcData[i];
-    rgba[4 * i] = texel.r;
-    rgba[4 * i + 1] = texel.g;
-    rgba[4 * i + 2] = texel.b;
-    rgba[4 * i + 3] = texel.a;
-  }
-  return {std::move(name), size, std::move(rgba)};
-}
-
 }  // namespace
 
-TextureSource::TextureSource(const aiScene& file, fs::path path, const ImportOptions& options)
-    : file_(file), path_(std::move(path)), options_(options) {}
+TextureSource::TextureSource(fs::path path, const ImportOptions& options) : path_(std::move(path)), options_(options) {}
 
-std::vector<fs::path> TextureSource::candidates(const std::string& reference) const {
+std::vector<fs::path> TextureSource::candidates(const std::string& name) const {
   std::vector<fs::path> paths;
-  for (const std::string& spelling : {reference, to_utf8(reference)}) {
+  for (const std::string& spelling : {name, to_utf8(name)}) {
     add_candidates(as_path(spelling), paths);
-    if (is_utf8(reference)) break;
+    if (is_utf8(name)) break;
   }
   return paths;
 }
@@ -94,27 +70,28 @@ void TextureSource::add_candidates(const fs::path& wanted, std::vector<fs::path>
   for (const fs::path& extra : options_.texture_folders) paths.push_back(extra / wanted.filename());
 }
 
-TextureSource::Found TextureSource::look_for(const std::string& reference) const {
-  Found found;
+TextureSource::Found TextureSource::look_for(const ImageReference& image) const {
+  Found found{.image = &image};
   try {
-    found.embedded = file_.GetEmbeddedTexture(reference.c_str());
-    if (found.embedded) {
-      found.size = is_raw(*found.embedded) ? raw_size(*found.embedded) : image_size(encoded(*found.embedded));
+    if (image.embedded) {
+      found.size = image_size(*image.embedded);
+      found.needs_basis = is_basis(*image.embedded);
     } else {
-      find_file(reference, found);
+      find_file(image.name, found);
     }
     if (found.size.pixels() > options_.limits.texture_pixels) {
       throw Error("is " + size_text(found.size) + " pixels, more than the limit of " +
                   std::to_string(options_.limits.texture_pixels) + " (raise limits.texture_pixels to allow it)");
     }
+    if (found.needs_basis && !options_.decode_basis) throw Error("is stored as Basis Universal");
   } catch (const Error& error) {
     found.problem = error.what();
   }
   return found;
 }
 
-void TextureSource::find_file(const std::string& reference, Found& found) const {
-  for (const fs::path& candidate : candidates(reference)) {
+void TextureSource::find_file(const std::string& name, Found& found) const {
+  for (const fs::path& candidate : candidates(name)) {
     std::error_code ignored;
     if (!fs::is_regular_file(candidate, ignored)) {
       found.trace.absent.push_back(candidate);
@@ -123,17 +100,18 @@ void TextureSource::find_file(const std::string& reference, Found& found) const 
     found.file = candidate;
     found.trace.read.push_back(candidate);
     check_limit(candidate.string(), "bytes", size_of_file(candidate), options_.limits.file_bytes, "file_bytes");
-    found.size = image_size(read_file(candidate));
+    const auto bytes = read_file(candidate);
+    found.size = image_size(bytes);
+    found.needs_basis = is_basis(bytes);
     return;
   }
   throw Error("was not found");
 }
 
-Texture TextureSource::decode(const std::string& reference, const Found& found) {
-  if (!found.embedded) return decode_image(found.file.filename().string(), read_file(found.file));
-  const aiTexture& image = *found.embedded;
-  const std::string name = image.mFilename.length > 0 ? image.mFilename.C_Str() : reference;
-  return is_raw(image) ? raw_texture(image, name) : decode_image(name, encoded(image));
+Texture TextureSource::decode(const Found& found) const {
+  const ImageReference& image = *found.image;
+  if (image.embedded) return decode_image(image.name, *image.embedded, options_.decode_basis);
+  return decode_image(found.file.filename().string(), read_file(found.file), options_.decode_basis);
 }
 
 void TextureSource::check_bytes(const std::vector<Found>& found) const {
@@ -145,14 +123,34 @@ void TextureSource::check_bytes(const std::vector<Found>& found) const {
               all, options_.limits.texture_bytes, "texture_bytes");
 }
 
-void TextureSource::load(const std::vector<std::string>& references, Scene& scene) {
-  std::vector<Found> found(references.size());
-  parallel_for(references.size(), [&](std::size_t i) { found[i] = look_for(references[i]); });
+void TextureSource::warn(const std::vector<Found>& found, Scene& scene) const {
+  const std::string file = path_.filename().string();
+  std::size_t undecodable = 0;
+  for (const Found& image : found) {
+    if (image.problem.empty()) continue;
+    if (image.needs_basis && !options_.decode_basis) {
+      ++undecodable;
+      continue;
+    }
+    const std::string& name = image.image->name;
+    scene.warnings.push_back((image.image->embedded ? name : "texture '" + name + "'") + " of " + file + " " +
+                             image.problem + "; drawn in a neutral colour");
+  }
+  if (undecodable == 0) return;
+  scene.warnings.push_back(std::to_string(undecodable) + (undecodable == 1 ? " image of " : " images of ") + file +
+                           (undecodable == 1 ? " is" : " are") +
+                           " stored as Basis Universal, whose decoder is not installed (pip install 'wiw[hm3d]'); "
+                           "drawn in a neutral colour");
+}
+
+void TextureSource::load(const std::vector<ImageReference>& images, Scene& scene) {
+  std::vector<Found> found(images.size());
+  parallel_for(images.size(), [&](std::size_t i) { found[i] = look_for(images[i]); });
   check_bytes(found);
-  std::vector<Texture> textures(references.size());
-  parallel_for(references.size(), [&](std::size_t i) {
+  std::vector<Texture> textures(images.size());
+  parallel_for(images.size(), [&](std::size_t i) {
     try {
-      if (found[i].problem.empty()) textures[i] = decode(references[i], found[i]);
+      if (found[i].problem.empty()) textures[i] = decode(found[i]);
     } catch (const Error& error) {
       found[i].problem = error.what();
     }
@@ -163,20 +161,20 @@ void TextureSource::load(const std::vector<std::string>& references, Scene& scen
       trace.read.insert(trace.read.end(), found[i].trace.read.begin(), found[i].trace.read.end());
       trace.absent.insert(trace.absent.end(), found[i].trace.absent.begin(), found[i].trace.absent.end());
     }
-    if (!found[i].problem.empty()) {
-      indices_[references[i]] = kNone;
-      scene.warnings.push_back("texture '" + references[i] + "' of " + path_.filename().string() + " " +
-                               found[i].problem + "; drawn in a neutral colour");
-      continue;
-    }
-    indices_[references[i]] = static_cast<std::int32_t>(scene.textures.size());
-    scene.textures.push_back(std::move(textures[i]));
+    if (found[i].problem.empty()) decoded_[images[i].name] = std::move(textures[i]);
   }
+  warn(found, scene);
 }
 
-std::int32_t TextureSource::find(const std::string& reference) const {
-  const auto found = indices_.find(reference);
-  return found == indices_.end() ? kNone : found->second;
+std::int32_t TextureSource::find(const std::string& image, const Sampling& sampling, Scene& scene) {
+  const auto decoded = decoded_.find(image);
+  if (decoded == decoded_.end()) return kNone;
+  const auto index = static_cast<std::int32_t>(scene.textures.size());
+  const auto [known, is_new] = indices_.try_emplace({image, sampling}, index);
+  if (!is_new) return known->second;
+  scene.textures.push_back(decoded->second);
+  scene.textures.back().sampling = sampling;
+  return index;
 }
 
 }  // namespace wiw::scene

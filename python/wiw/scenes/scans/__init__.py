@@ -12,6 +12,7 @@ from typing import Any
 
 from wiw import _core
 from wiw.errors import ArgumentError, FileError
+from wiw.scenes.basis import import_mesh
 from wiw.scenes.scans import hm3d, matterport, replica, scene_dataset
 from wiw.scenes.scans.scan import Imported, require_folder, require_scans
 
@@ -55,8 +56,7 @@ def read_scene(file: Path, options: dict[str, Any]) -> Imported:
     reader, options = options.get("scan"), {name: value for name, value in options.items() if name != "scan"}
     if reader is not None:
         return _READERS[reader[0]](file, options)
-    scene, read, absent = _core.scene.import_scene(file, **options)
-    return Imported(scene, list(read), list(absent))
+    return Imported(*import_mesh(file, **options))
 
 
 def parse_spec(spec: str) -> tuple[str, Path, str] | None:

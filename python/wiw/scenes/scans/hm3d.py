@@ -17,12 +17,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from wiw.errors import FileError
+from wiw.scenes.basis import import_scan
 from wiw.scenes.scans import labels as transfer
-from wiw.scenes.scans.basis import import_textured
 from wiw.scenes.scans.glb import UNREADABLE, Glb
 from wiw.scenes.scans.scan import (
     Imported,
     ScanObject,
+    import_options,
     number_objects,
     read_text,
     require_file,
@@ -96,7 +97,8 @@ def read_annotations(path: Path) -> Annotations:
 def read(file: Path, options: dict[str, Any]) -> Imported:
     """Read a scan; one without labels, as most are, has no instances of objects, and a warning."""
     up = options.get("up") or "z"
-    scene, read, absent, warnings = import_textured(file, options, up)
+    scene, read, absent = import_scan(file, **import_options(options, up))
+    warnings: list[str] = []
     painted, listed = _labels(file)
     surface = transfer.Surface(*scene.world_triangles()[:2])
     about = {"up": f"{up.upper()} (HM3D)", "dataset": "HM3D"}

@@ -18,6 +18,7 @@ from numpy.typing import NDArray
 
 from wiw import _core
 from wiw.errors import FileError
+from wiw.scenes.basis import import_scan
 from wiw.scenes.scans import labels as transfer
 from wiw.scenes.scans.scan import (
     Imported,
@@ -184,7 +185,7 @@ def _semantic(file: Path) -> Path:
 def read(file: Path, options: dict[str, Any]) -> Imported:
     """Read a scan; without its `_semantic.ply` it has no instances of objects, and a warning."""
     up = options.get("up") or "z"
-    scene, read, absent = _core.scene.import_scene(file, **import_options(options, up))
+    scene, read, absent = import_scan(file, **import_options(options, up))
     house_file = require_file(_house(file), "expected Matterport3D's table of objects beside the mesh")
     house = read_house(house_file)
     rooms = name_rooms(house, up)

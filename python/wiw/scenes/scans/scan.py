@@ -171,5 +171,6 @@ def require_scans(found: list[Path], folder: Path, expected: str) -> list[Path]:
 
 
 def import_options(options: Mapping[str, Any], up: str) -> dict[str, Any]:
-    """Return the options of the core's importer for the mesh of a scan."""
-    return {name: options[name] for name in ("ceiling", "limits", "texture_folders") if name in options} | {"up": up}
+    """Return the options of `wiw.scenes.basis.import_scan` for the mesh of a scan."""
+    known = {name: options[name] for name in ("ceiling", "limits", "texture_folders") if name in options}
+    return known | {"up": up, "allow_missing": bool(options.get("allow_missing_textures"))}

@@ -23,8 +23,16 @@ from numpy.typing import NDArray
 from wiw import _core
 from wiw.errors import Error, FileError
 from wiw.json_text import parse_json
-from wiw.scenes.scans.basis import import_textured
-from wiw.scenes.scans.scan import Imported, box_to_y_up, read_text, require_folder, require_scans, rotation_of
+from wiw.scenes.basis import import_scan
+from wiw.scenes.scans.scan import (
+    Imported,
+    box_to_y_up,
+    import_options,
+    read_text,
+    require_folder,
+    require_scans,
+    rotation_of,
+)
 from wiw.scenes.scans.urdf import read_visuals
 
 ENDING = ".scene_instance.json"
@@ -253,13 +261,12 @@ class _Assembly:
             if not file.is_file():
                 self.missing.append(str(file))
                 return None
-            scene, read, absent, warnings = import_textured(file, self.options, "y")
+            scene, read, absent = import_scan(file, **import_options(self.options, "y"))
             self.indices[file] = len(self.parts)
             self.boxes[file] = scene.bounds.astype(float)
             self.parts.append(scene)
             self.read += read
             self.absent += absent
-            self.warnings += warnings
         return self.indices[file]
 
     def template(self, section: str, name: Any) -> Template | None:
