@@ -127,7 +127,9 @@ def test_hard_first_looks_take_turns_and_are_what_they_say() -> None:
             ahead = np.asarray(place.scene.instances[target - 1]["T_world_instance"])[[0, 2], 2]
             bearings = [np.subtract(spot, episode.goal_position)[[0, 2]] for spot in (start, best)]
             angles = [np.degrees(np.arccos(way @ ahead / np.linalg.norm(way))) for way in bearings]
-            assert angles[0] >= 75 and angles[1] <= 50 and np.linalg.norm(bearings[0]) <= rules.nearby
+            assert (
+                angles[0] >= rules.averted and angles[1] <= rules.facing and np.linalg.norm(bearings[0]) <= rules.nearby
+            )
             assert angles == pytest.approx(
                 [episode.info["view_angle_deg"], episode.info["best_view_angle_deg"]], abs=0.1
             )
@@ -155,9 +157,11 @@ def test_furniture_faces_where_one_can_stand(two_rooms: str) -> None:
 def test_the_preset_asks_for_them() -> None:
     task = AR(preset="foresight")
     assert (task.decisions, task.rules.candidates, task.rules.horizon) == (1, 3, 8)
-    assert task.generator == ar.EpisodeRules(first_look="balanced")
-    assert AR(preset="foresight", decisions=3, first_look="any").generator == AR().generator == ar.EpisodeRules()
-    assert task.describe()["generator"] == {"first_look": "balanced"} and "generator" not in AR().describe()
+    assert task.generator == ar.EpisodeRules(first_look="balanced", small=0.4)
+    assert AR(preset="foresight", first_look="any", small=0.25).generator == AR().generator == ar.EpisodeRules()
+    assert (
+        task.describe()["generator"] == {"first_look": "balanced", "small": 0.4} and "generator" not in AR().describe()
+    )
 
 
 def test_the_best_view_is_as_many_primitives_away_as_it_says(two_rooms: str) -> None:

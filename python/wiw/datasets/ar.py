@@ -148,9 +148,9 @@ class EpisodeRules:
     """Starts tried for a target."""
     first_look: Literal["any", "balanced"] = "any"
     """any: hidden or small, as they come; balanced: hidden, small and averted take turns."""
-    averted: float = 75.0
+    averted: float = 70.0
     """Averted: least degrees between the target's front and the direction to the start ..."""
-    facing: float = 50.0
+    facing: float = 55.0
     """... and most degrees between its front and the direction to the best view ..."""
     nearby: float = 3.0
     """... from at most this far away, so that it is hard for its side alone."""
@@ -214,11 +214,10 @@ def generate(
     made: list[Episode] = []
     tally = Counter(before)
     balanced = rules.first_look == "balanced"
-    for round_ in range(count):
+    for round_ in range(count + len(FIRST_LOOKS) if balanced else count):
         for number, category in enumerate(_order(things, tally, core.fold_key([key, round_]))):
             draw = core.fold_key([key, round_, number])
-            # After the first round, other looks make up for those that the scene does not offer.
-            look = FIRST_LOOKS[(first + len(made)) % len(FIRST_LOOKS)] if balanced and not round_ else None
+            look = _choose_look(tally.total(), round_) if balanced else None
             episode = _episode(world, survey, things[category], draw, rules, made, look)
             if episode is not None:
                 made.append(episode)
@@ -228,6 +227,11 @@ def generate(
     raise ArgumentError(
         f"{world.name}: only {len(made)} of {count} targets and starts satisfy {rules}; ask for fewer in a scene"
     )
+
+
+def _choose_look(number: int, round_: int) -> str | None:
+    """Return the look whose turn it is: where a round did not find it, the next one, and in the end any."""
+    return FIRST_LOOKS[(number + round_) % len(FIRST_LOOKS)] if round_ < len(FIRST_LOOKS) else None
 
 
 def _targets(world: World, categories: Sequence[str]) -> dict[str, list[Mapping[str, Any]]]:
@@ -276,7 +280,7 @@ def _episode(
             continue
         ahead = np.arctan2(-(centre - start)[0], -(centre - start)[2])
         yaw = float(ahead + np.radians(rules.turned) * (2 * draws[1] - 1)) % (2 * np.pi)
-        averted = share > rules.hidden and _is_averted(start, centre, front, rules)
+        averted = share > rules.hidden and bool(_are_averted(start, centre, front, rules))
         best = _best_view(world, start, yaw, name, rules, (centre, front) if averted and front is not None else None)
         reason = None if best is None else _find_reason(size, share, averted, best, rules)
         if best is None or reason is None or look not in (None, reason):
@@ -344,13 +348,14 @@ def _measure_view_angles(
     return np.asarray(np.degrees(np.arccos(np.clip(cosines, -1, 1))))
 
 
-def _is_averted(
-    start: NDArray[np.float64], centre: NDArray[np.float64], front: NDArray[np.float64] | None, rules: EpisodeRules
-) -> bool:
+def _are_averted(
+    places: NDArray[np.float64], centre: NDArray[np.float64], front: NDArray[np.float64] | None, rules: EpisodeRules
+) -> NDArray[np.bool_]:
+    """Return whether a target is seen from the side or from behind at places [..., 3], and from nearby."""
     if rules.first_look != "balanced" or front is None:
-        return False
-    way = (start - centre)[[0, 2]]
-    return float(np.hypot(*way)) <= rules.nearby and bool(_measure_view_angles(start, centre, front) >= rules.averted)
+        return np.zeros(places.shape[:-1], bool)
+    away = np.hypot(*np.moveaxis((places - centre)[..., [0, 2]], -1, 0))
+    return np.asarray((away <= rules.nearby) & (_measure_view_angles(places, centre, front) >= rules.averted))
 
 
 def _starts(
@@ -363,24 +368,25 @@ def _starts(
 ) -> Iterator[tuple[NDArray[np.float64], float, float]]:
     """Yield places from which at least a little of the target is seen, with its size and visible share there.
 
-    Those that may be hard by the `look` come first; without one, where it is hidden.
+    Only those that may be hard by the `look`; without one all, those where it is hidden first.
     """
     instance, centre = int(target["id"]), np.asarray(target["bounds"], np.float64).mean(axis=0)
     away = np.hypot(*(survey.points - centre)[:, [0, 2]].T)
-    near = np.flatnonzero((away >= rules.nearest) & (away <= rules.farthest) & (survey.sizes[:, instance] > 0))
-    if not len(near):
+    near = (away >= rules.nearest) & (away <= rules.farthest) & (survey.sizes[:, instance] > 0)
+    if look == SMALL_LOOK:
+        near &= survey.sizes[:, instance] <= 1.2 * rules.tiny  # which is a rough measure
+    elif look == AVERTED_LOOK:
+        near &= _are_averted(survey.points, centre, find_front(world, target), rules)
+    close = np.flatnonzero(near)
+    if not len(close):
         return
-    points = survey.points[near[np.argsort(core.uniform(key, len(near)))][: rules.places]]
+    points = survey.points[close[np.argsort(core.uniform(key, len(close)))][: rules.places]]
     sizes = measure_sizes(world, points)[:, instance]
     points, sizes = points[sizes >= rules.seen], sizes[sizes >= rules.seen]
     shares = np.minimum(1.0, sizes / np.maximum(measure_unoccluded_sizes(world, points, instance), 1e-9))
-    # The hidden ones first; the others have to be far or foreshortened, which only the best view tells.
-    later = shares > rules.hidden
-    if look == SMALL_LOOK:
-        later = ~(later & (sizes <= rules.tiny))
-    elif look == AVERTED_LOOK:
-        front = find_front(world, target)
-        later = ~(later & [_is_averted(point, centre, front, rules) for point in points])
+    # The hidden ones first, unless another look is asked for; those that are far or foreshortened only the best view
+    # tells.
+    later = shares > rules.hidden if look in (None, HIDDEN_LOOK) else shares <= rules.hidden
     for i in np.argsort(later, kind="stable")[: rules.attempts]:
         if look is not None and later[i]:
             return
