@@ -12,6 +12,7 @@ from typing import Any
 import numpy as np
 import pytest
 
+from wiw.cli import main
 from wiw.datasets import ar, visibility
 from wiw.datasets import episodes as episode_file
 from wiw.datasets.worlds import world
@@ -157,11 +158,19 @@ def test_furniture_faces_where_one_can_stand(two_rooms: str) -> None:
 def test_the_preset_asks_for_them() -> None:
     task = AR(preset="foresight")
     assert (task.decisions, task.rules.candidates, task.rules.horizon) == (1, 3, 8)
-    assert task.generator == ar.EpisodeRules(first_look="balanced", small=0.4)
-    assert AR(preset="foresight", first_look="any", small=0.25).generator == AR().generator == ar.EpisodeRules()
-    assert (
-        task.describe()["generator"] == {"first_look": "balanced", "small": 0.4} and "generator" not in AR().describe()
-    )
+    asked = {"first_look": "balanced", "hidden": 0.3, "tiny": 0.006, "small": 0.4, "averted": 90.0, "facing": 60.0}
+    assert task.generator == ar.EpisodeRules(**asked)
+    assert AR(preset="foresight", hidden=0.2).generator == ar.EpisodeRules(**{**asked, "hidden": 0.2})
+    assert task.describe()["generator"] == asked and "generator" not in AR().describe()
+    assert AR().generator == ar.EpisodeRules()
+
+
+def test_the_command_writes_the_episodes_of_a_preset(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    command = ["episodes", "ar", "--scenes", "apartments:val:1", "--episodes", "1", "--out", str(tmp_path / "a.json")]
+    assert main([*command, "--preset", "forsight"]) == 2
+    assert "no preset 'forsight'" in capsys.readouterr().err
+    assert main([*command, "--preset", "foresight"]) == 0
+    assert ar.load(tmp_path / "a.json")[0][0].info["first_look"] in ar.FIRST_LOOKS
 
 
 def test_the_best_view_is_as_many_primitives_away_as_it_says(two_rooms: str) -> None:
