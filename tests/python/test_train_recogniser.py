@@ -72,7 +72,9 @@ def made_up(sets: int, seed: int) -> GlimpseSets:
 def lesson() -> Any:
     from wiw.training.recogniser import Recipe, calibrate, train
 
-    recipe = Recipe(epochs=12, batch=24, width=8, seed=3, recolor=0, degrade=0)  # here colour tells what misleads
+    recipe = Recipe(
+        epochs=12, batch=24, width=8, seed=3, recolor=0, transplant=0, degrade=0
+    )  # here colour tells what misleads
     network, used = train(made_up(240, 0), NAMES, recipe)
     assert used == recipe
     calibration, held_out = split_in_half(made_up(500, 1))
@@ -183,6 +185,19 @@ def test_glimpses_of_a_set_get_the_same_colours_and_boxes_others_inside() -> Non
     assert not torch.allclose(found[0], found[2])
     assert len(found[0, 0, 0].unique()) == 2 and found[0, 0, :, 3, 3].tolist() != found[0, 0, :, 0, 0].tolist()
     assert found.min() >= 0 and found.max() <= 1
+
+
+def test_boxes_keep_their_content_where_surroundings_change() -> None:
+    from wiw.training.recogniser import _transplant
+
+    colours = torch.arange(6.0)[:, None, None, None, None].expand(6, 2, 3, 8, 8) / 6
+    boxes = torch.full((6, 2, 8, 8), -1.0)
+    boxes[..., 2:6, 2:6] = 1
+    found = _transplant(colours, boxes, 1.0, np.random.default_rng(0))
+    assert torch.equal(found[..., 2:6, 2:6], colours[..., 2:6, 2:6])
+    assert sorted(found[:, 0, 0, 0, 0].tolist()) == colours[:, 0, 0, 0, 0].tolist()
+    assert not torch.equal(found[:, 0, 0, 0, 0], colours[:, 0, 0, 0, 0])
+    assert torch.equal(_transplant(colours, boxes, 0.0, np.random.default_rng(0)), colours)
 
 
 def test_reshaped_furniture_keeps_to_its_place_and_all_is_back_afterwards(two_rooms: str) -> None:

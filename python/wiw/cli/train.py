@@ -291,12 +291,13 @@ def _train_recogniser(
     held_out = gather_glimpse_sets(data.val, names, data.seed, as_they_are, **data.gathering)
     calibration, held_out = split_in_half(held_out)
     held_out_hard = gather_hard_sets(data.val, names, data.seed, **data.gathering)
+    samples = merge_glimpse_sets([looks, *[hard] * recipe.hard])
     with _StepBar() as steps:
         network, recipe = training.train(
-            merge_glimpse_sets([looks, *[hard] * recipe.hard]), names, recipe, minutes, steps, start and start.network
+            samples, names, recipe, minutes, steps, None if start is None else start.network
         )
     card = {"scenes": data.scenes, "val": data.val, "sets": len(looks), "hard_sets": len(hard)}
-    card |= {"looks": asdict(rules), "recipe": asdict(recipe), "began_with": start and start.card}
+    card |= {"looks": asdict(rules), "recipe": asdict(recipe), "began_with": None if start is None else start.card}
     calibrated = training.calibrate(network, names, calibration, held_out, card, held_out_hard)
     calibrated.save(out)
     _report_recogniser(calibrated.card, calibrated.temperature)

@@ -46,6 +46,8 @@ class Recipe:
     """Weight of the loss of single glimpses beside that of sets."""
     recolor: float = 0.5
     """Share of sets whose colours change places, and of those whose target, or all of them, is grey or tinted."""
+    transplant: float = 0.2
+    """Share of glimpses whose surroundings are those of another one."""
     degrade: float = 0.25
     """Share of glimpses that are blurred, of those with noise, and of those with a part covered."""
     seed: int = 0
@@ -196,7 +198,8 @@ def _augment(
     scalars[:, REAL_COLUMN] = found.scalars[:, REAL_COLUMN]
     shown = to_network_input(torch.from_numpy(found.images), torch.from_numpy((found.boxes + off).astype(np.float32)))
     colours, boxes = _split_channels(shown)
-    colours = _degrade(_recolor(colours, boxes, owners, recipe.recolor, rng), recipe.degrade, rng)
+    colours = _recolor(colours, boxes, owners, recipe.recolor, rng)
+    colours = _degrade(_transplant(colours, boxes, recipe.transplant, rng), recipe.degrade, rng)
     shown = torch.cat([colours, boxes[:, :, None]], dim=2).flatten(1, 2)
     mirrored = torch.from_numpy(rng.random(len(rows)) < 0.5)
     shown = torch.where(mirrored[:, None, None, None], shown.flip(3), shown)
@@ -221,6 +224,13 @@ def _recolor(
     mixed = torch.where((boxes > 0)[:, :, None], boxed, everywhere).clamp(0, 1)
     gamma = torch.from_numpy(rng.uniform(0.75, 1.35, count).astype(np.float32))[owners]
     return mixed.clamp_min(1e-3) ** gamma[:, None, None, None, None]
+
+
+def _transplant(colours: Tensor, boxes: Tensor, share: float, rng: np.random.Generator) -> Tensor:
+    """Return colours in which some boxes are surrounded by what surrounds those of other glimpses."""
+    moved = torch.from_numpy(rng.random(len(colours)) < share)
+    others = torch.from_numpy(rng.permutation(len(colours)))
+    return torch.where(moved[:, None, None, None, None] & (boxes <= 0)[:, :, None], colours[others], colours)
 
 
 def _draw_color_matrices(count: int, share: float, rng: np.random.Generator) -> Tensor:
