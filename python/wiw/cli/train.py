@@ -131,7 +131,7 @@ def train(
     states and of colour words on the val scenes; for armnet, errors on held-out plays, beside copy and a table where
     nothing but the arm moves. diffuser is not evaluated. The weights shipped with wiw were trained by this command with
     its defaults; those of perception for four epochs of a schedule that was first laid out for six
-    (docs/perception.md), those of pocket on 16 800 clips.
+    (docs/perception.md), those of pocket on 16 800 clips, those of recogniser by an earlier recipe (docs/results.md).
 
     Args:
         what: recogniser, warpnet, pocket, perception, armnet, diffuser or a video model.
