@@ -206,7 +206,8 @@ class TableSpec:
     judged: tuple[str, ...] = ()
     """Metrics that depend on a judge's marks."""
     cuts: tuple[int, ...] = ()
-    """Primitives at which the anytime curve is read, from the metrics "score_at_30" and so on."""
+    """Primitives at which the anytime curve is read, from the metrics "score_at_30" and so on; without any, it is that
+    of success over decisions."""
     kind: str = "kind of task"
     """Word for a kind."""
 

@@ -157,14 +157,16 @@ def test_a_sure_answer_ends_an_episode_before_anything_is_carried_out(file: Path
     assert (CHOICES[int(result["category"])], CHOICES[int(result["predicted"])]) == ("table", "table")
 
 
-@pytest.mark.parametrize(("preset", "success"), [("paper", 0), ("official", 1)])
-def test_the_last_answer_counts_or_the_surest(file: Path, preset: str, success: int) -> None:
-    task = AR(episode_file=file, preset=preset, decisions=2)
+@pytest.mark.parametrize(("preset", "right"), [("paper", [False, True, False]), ("official", [False, True, True])])
+def test_the_last_answer_counts_or_the_surest(file: Path, preset: str, right: list[bool]) -> None:
+    task = AR(episode_file=file, preset=preset, decisions=3)
     env = task.environment()
     env.begin(task.episode(0))
+    env.run([TURN_LEFT], answer("shelf", 0.5))
     env.run([TURN_LEFT], answer("table", 0.9))
     assert env.run([TURN_LEFT], answer("chest", 0.6)).truncated
-    assert env.result()["success"] == success
+    assert env.result()["success"] == right[-1]
+    assert env.details() == {"right_after": right}
 
 
 @pytest.mark.parametrize(("lost", "ended"), [("continue", False), ("stop", True)])
@@ -283,7 +285,7 @@ def test_the_report_speaks_of_answers(file: Path, tmp_path: Path) -> None:
     assert "The boxed thing: table" in page
     assert "Answer: table, 50 %" in page
     assert "recognised in 2 decisions" in page
-    assert "recognised the target, %" in page
+    assert "success rate, %" in page and "SR if cut after so many decisions" in page
     shown = (log.view().read_text(), *(file.read_text() for file in log.view().parent.glob("episodes/*.html")))
     assert len(shown) == 2 and not any(
         re.search("the goal|reached", without_tags(text), re.I) for text in [page, *shown]

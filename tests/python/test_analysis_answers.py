@@ -233,5 +233,5 @@ def test_the_page_speaks_of_answers(run: Path) -> None:
     page = load_run(run).report().read_text()
     about = page[page.index('id="about"') :]
     assert "Actions" not in about and "Mean mark of the answers" in about and "shortest walk" in about
-    assert page.count("<svg") >= 5 and "Score by budget" in page and "Gain over none by budget" in page
+    assert page.count("<svg") >= 4 and "Score by budget" in page and "Gain over none by budget" in page
     assert "Counterfactual twins" in page and "Score by category" in page

@@ -12,6 +12,7 @@ from typing import Any
 import numpy as np
 import pytest
 
+from wiw.cli import main
 from wiw.datasets import ar, visibility
 from wiw.datasets import episodes as episode_file
 from wiw.datasets.worlds import world
@@ -97,6 +98,79 @@ def test_no_two_episodes_show_a_target_from_one_place(two_rooms: str) -> None:
     )
     assert len({(episode.info["target"], episode.start_position) for episode in made}) == 8
     assert max(Counter(episode.info["category"] for episode in made).values()) == 4
+
+
+def test_default_episodes_stay_as_they_were() -> None:
+    made = ar.generate(world("apartments:val/0", "cpu"), 2, 0)
+    found = [(e.info["category"], e.info["visible"], e.info["best_primitives"]) for e in made]
+    assert found == [("toilet", pytest.approx(0.117, abs=2e-3), 8), ("chair", pytest.approx(0.344, abs=2e-3), 6)]
+    assert set(made[0].info) == {
+        *("target", "category", "difficulty", "visible", "best_position", "best_primitives", "best_visible")
+    }
+
+
+def test_hard_first_looks_take_turns_and_are_what_they_say() -> None:
+    place, rules = world("apartments:val/0", "cpu"), ar.EpisodeRules(first_look="balanced", survey=120, places=15)
+    made = ar.generate(place, 3, 0, rules=rules)
+    assert [episode.info["first_look"] for episode in made] == ["hidden", "small", "averted"]
+    for episode in made:
+        start, best = np.asarray(episode.start_position), np.asarray(episode.info["best_position"])
+        target = episode.info["target"]
+        now, then = visibility.measure_sizes(place, np.stack([start, best]))[:, target]
+        share = visibility.visible_fraction(place, start, target)
+        if episode.info["first_look"] == "hidden":
+            assert share <= rules.hidden and then >= rules.gain * now
+        else:
+            assert share > rules.hidden
+        if episode.info["first_look"] == "small":
+            assert now <= rules.tiny and now <= rules.small * then
+        if episode.info["first_look"] == "averted":
+            ahead = np.asarray(place.scene.instances[target - 1]["T_world_instance"])[[0, 2], 2]
+            bearings = [np.subtract(spot, episode.goal_position)[[0, 2]] for spot in (start, best)]
+            angles = [np.degrees(np.arccos(way @ ahead / np.linalg.norm(way))) for way in bearings]
+            assert (
+                angles[0] >= rules.averted and angles[1] <= rules.facing and np.linalg.norm(bearings[0]) <= rules.nearby
+            )
+            assert angles == pytest.approx(
+                [episode.info["view_angle_deg"], episode.info["best_view_angle_deg"]], abs=0.1
+            )
+
+
+def test_furniture_faces_where_one_can_stand(two_rooms: str) -> None:
+    place = world("apartments:val/0", "cpu")
+    behind = ahead = 0
+    for thing in place.scene.instances:
+        front = ar.find_front(place, thing)
+        if thing["category"] not in ("sofa", "bookshelf", "dresser", "wardrobe", "bathtub", "toilet", "sink"):
+            continue
+        low, high = np.asarray(thing["bounds"], float)
+        reach = np.abs(front) @ (high - low) / 2 + 0.2
+        spots = (low + high) / 2 * [1, 0, 1] + reach * np.stack([front, -front])
+        free = place.navmesh.is_navigable(place.ground.put_down(spots).astype(float))
+        ahead, behind = ahead + int(free[0]), behind + int(free[1])
+    assert ahead >= 3 and not behind
+    lamp = next(thing for thing in place.scene.instances if thing["category"] == "floor lamp")
+    assert ar.find_front(place, lamp) is None, "it looks alike from all sides"
+    bare = world(two_rooms, "cpu")
+    assert all(ar.find_front(bare, thing) is None for thing in bare.scene.instances), "nobody knows their fronts"
+
+
+def test_the_preset_asks_for_them() -> None:
+    task = AR(preset="foresight")
+    assert (task.decisions, task.rules.candidates, task.rules.horizon) == (1, 3, 8)
+    asked = {"first_look": "balanced", "hidden": 0.3, "tiny": 0.006, "small": 0.4, "averted": 90.0, "facing": 60.0}
+    assert task.generator == ar.EpisodeRules(**asked)
+    assert AR(preset="foresight", hidden=0.2).generator == ar.EpisodeRules(**{**asked, "hidden": 0.2})
+    assert task.describe()["generator"] == asked and "generator" not in AR().describe()
+    assert AR().generator == ar.EpisodeRules()
+
+
+def test_the_command_writes_the_episodes_of_a_preset(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    command = ["episodes", "ar", "--scenes", "apartments:val:1", "--episodes", "1", "--out", str(tmp_path / "a.json")]
+    assert main([*command, "--preset", "forsight"]) == 2
+    assert "no preset 'forsight'" in capsys.readouterr().err
+    assert main([*command, "--preset", "foresight"]) == 0
+    assert ar.load(tmp_path / "a.json")[0][0].info["first_look"] in ar.FIRST_LOOKS
 
 
 def test_the_best_view_is_as_many_primitives_away_as_it_says(two_rooms: str) -> None:

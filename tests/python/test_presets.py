@@ -70,6 +70,8 @@ def test_a_file_of_ones_own_starts_from_a_shipped_preset(tmp_path: Path) -> None
         ("motion: fly", ArgumentError, "motion: expected one of refuse, slide, got 'fly'"),
         ("radius: wide", ArgumentError, "radius: expected a value of type float"),
         ("horizon: 0", ArgumentError, "must be positive"),
+        ("generator: 3", ArgumentError, "own.yaml: generator: expected rules of generated episodes"),
+        ("generator: {nearby: 3}", ArgumentError, "unknown rules nearby"),
         ("base: mine", ArgumentError, "base 'mine' is not one of default, paper, official"),
         ("- 1\n- 2", FileError, "expected rules as `name: value` lines, got list"),
         ("a: [", FileError, "own.yaml"),

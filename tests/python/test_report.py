@@ -84,7 +84,7 @@ def test_the_page_shows_every_arm_decision_and_failure(log, page):
 
 def test_a_task_that_says_nothing_of_itself_is_spoken_of_plainly(page):
     text = " ".join(page.texts)
-    assert "percent of episodes that succeeded." in text and "succeeded, %" in text
+    assert "percent of episodes that succeeded." in text and "success rate, %" in text
     assert "not succeeded after" in text and "reached" not in text
 
 

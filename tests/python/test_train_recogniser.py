@@ -12,9 +12,25 @@ import numpy as np
 import pytest
 
 from wiw.cli.app import main
+from wiw.datasets.ar import EpisodeRules
+from wiw.datasets.imagenav import camera_pose
+from wiw.datasets.worlds import world
 from wiw.errors import ArgumentError
 from wiw.perception.glimpses import SIDE, Glimpses
-from wiw.training.glimpse_sets import PERFECT, START, WARPED, GlimpseSets, merge_glimpse_sets, split_in_half
+from wiw.training.glimpse_sets import (
+    NEAR,
+    PERFECT,
+    START,
+    WARPED,
+    GlimpseSetRules,
+    GlimpseSets,
+    _stretch,
+    collect_hard_sets,
+    join_glimpse_sets,
+    merge_glimpse_sets,
+    reshape_furniture,
+    split_in_half,
+)
 
 pytestmark = pytest.mark.usefixtures("one_torch_thread")
 
@@ -56,7 +72,9 @@ def made_up(sets: int, seed: int) -> GlimpseSets:
 def lesson() -> Any:
     from wiw.training.recogniser import Recipe, calibrate, train
 
-    recipe = Recipe(epochs=12, batch=24, width=8, seed=3)
+    recipe = Recipe(
+        epochs=12, batch=24, width=8, seed=3, recolor=0, transplant=0, degrade=0
+    )  # here colour tells what misleads
     network, used = train(made_up(240, 0), NAMES, recipe)
     assert used == recipe
     calibration, held_out = split_in_half(made_up(500, 1))
@@ -130,6 +148,101 @@ def test_looks_are_counted_through(lesson: Any) -> None:
         split_in_half(first)
 
 
+def test_training_goes_on_from_a_network() -> None:
+    from wiw.training.recogniser import Recipe, train
+
+    looks, recipe = made_up(40, 5), Recipe(epochs=1, batch=10, width=4, rate=0.0)
+    first = train(looks, NAMES, recipe)[0]
+    again = train(looks, NAMES, replace(recipe, seed=1), start=first)[0]
+    assert torch.equal(first.logits.weight, again.logits.weight)
+    assert not torch.equal(first.logits.weight, train(looks, NAMES, replace(recipe, seed=1))[0].logits.weight)
+    with pytest.raises(ArgumentError, match="expected a start of 3 categories and width 8, got 3 and 4"):
+        train(looks, NAMES, Recipe(width=8), start=first)
+
+
+def test_batches_are_pairs_of_categories_that_are_confused() -> None:
+    from wiw.training.recogniser import Recipe, _Trainer
+
+    looks = made_up(90, 2)
+    trainer = _Trainer(looks, NAMES, Recipe(batch=60, width=4))
+    trainer._confusion = np.array([[0.1, 0.9, 0.0], [0.9, 0.1, 0.0], [0.5, 0.5, 0.0]])
+    first, second = looks.labels[trainer._draw_sets()].reshape(2, 30)
+    assert {(a, b) for a, b in zip(first, second, strict=True)} == {(0, 1), (1, 0), (2, 0), (2, 1)}
+    before = trainer._confusion.copy()
+    trainer.train_step(1e-3)
+    assert not np.array_equal(trainer._confusion, before)
+    np.testing.assert_allclose(trainer._confusion.sum(axis=1), 1, atol=1e-6)
+
+
+def test_glimpses_of_a_set_get_the_same_colours_and_boxes_others_inside() -> None:
+    from wiw.training.recogniser import _recolor
+
+    grey = torch.full((4, 2, 3, 8, 8), 0.5)
+    boxes = torch.full((4, 2, 8, 8), -1.0)
+    boxes[..., 2:6, 2:6] = 1
+    found = _recolor(grey, boxes, np.array([0, 0, 1, 1]), 1.0, np.random.default_rng(0))
+    assert torch.equal(found[0], found[1]) and torch.equal(found[2], found[3])
+    assert not torch.allclose(found[0], found[2])
+    assert len(found[0, 0, 0].unique()) == 2 and found[0, 0, :, 3, 3].tolist() != found[0, 0, :, 0, 0].tolist()
+    assert found.min() >= 0 and found.max() <= 1
+
+
+def test_boxes_keep_their_content_where_surroundings_change() -> None:
+    from wiw.training.recogniser import _transplant
+
+    colours = torch.arange(6.0)[:, None, None, None, None].expand(6, 2, 3, 8, 8) / 6
+    boxes = torch.full((6, 2, 8, 8), -1.0)
+    boxes[..., 2:6, 2:6] = 1
+    found = _transplant(colours, boxes, 1.0, np.random.default_rng(0))
+    assert torch.equal(found[..., 2:6, 2:6], colours[..., 2:6, 2:6])
+    assert sorted(found[:, 0, 0, 0, 0].tolist()) == colours[:, 0, 0, 0, 0].tolist()
+    assert not torch.equal(found[:, 0, 0, 0, 0], colours[:, 0, 0, 0, 0])
+    assert torch.equal(_transplant(colours, boxes, 0.0, np.random.default_rng(0)), colours)
+
+
+def test_reshaped_furniture_keeps_to_its_place_and_all_is_back_afterwards(two_rooms: str) -> None:
+    place = world(two_rooms, "cpu")
+    labels = np.array([-1, *(0 if thing["category"] == "table" else -1 for thing in place.scene.instances)])
+    table = int(np.flatnonzero(labels == 0)[0])
+    bounds = np.asarray(place.scene.instances[table - 1]["bounds"], float)
+    home = np.asarray(place.scene.instances[table - 1]["T_world_instance"], float)
+    pivot = bounds.mean(axis=0) * [1, 0, 1] + bounds[0] * [0, 1, 0]
+    factors = np.array([[1.2, 0.8, 1.1]])
+    moved = _stretch(home[None], factors, pivot[None])[0]
+    local = np.linalg.solve(home[:3, :3], pivot - home[:3, 3])
+    np.testing.assert_allclose(moved[:3, :3] @ local + moved[:3, 3], pivot)
+    np.testing.assert_allclose(np.linalg.norm(moved[:3, :3], axis=0), factors[0], atol=1e-6)
+
+    poses = np.stack([camera_pose(np.array([-1.2, 0.0, -1.2]), 0.0)])
+    before = place.renderer.panorama(poses, (144, 256))
+    with reshape_furniture(place, labels, 5, 1.5):
+        within = place.renderer.panorama(poses, (144, 256))
+    after = place.renderer.panorama(poses, (144, 256))
+    sizes = [(shown["instance"] == table).sum() for shown in (before, within)]
+    assert sizes[0] != sizes[1] > 0
+    for output, pixels in before.items():
+        np.testing.assert_array_equal(after[output], pixels, output)
+    with reshape_furniture(place, labels, 5, 1.0):
+        np.testing.assert_array_equal(place.renderer.panorama(poses, (144, 256))["color"], before["color"])
+    with pytest.raises(ArgumentError, match="reshape: expected a factor of 1 or more"):
+        GlimpseSetRules(reshape=0.5)
+
+
+def test_hard_sets_begin_with_the_hard_look_and_end_with_a_better_one(two_rooms: str) -> None:
+    rules = EpisodeRules(hidden=0.75, gain=1.2, small=0.6, tiny=1.0, survey=80)  # two bare rooms hide little
+    found = collect_hard_sets(world(two_rooms, "cpu"), 1, ("chest", "picture", "shelf", "table"), 3, rules)
+    assert len(found) == 3
+    for number in range(3):
+        own = found.owners == number
+        kinds = found.kinds[own]
+        assert kinds[0] == START and np.count_nonzero(kinds == START) == 1
+        area = np.prod(found.glimpses.scalars[own][:, :2], axis=1)
+        best = np.flatnonzero(kinds == NEAR)[-1]
+        assert area[best] > area[0], "the last real look is from the best view"
+    rest = join_glimpse_sets([])
+    assert len(rest) == 0 and len(join_glimpse_sets([rest, found, rest])) == 3
+
+
 @pytest.mark.nightly
 def test_the_command_trains_on_apartments(
     tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
@@ -148,10 +261,11 @@ def test_the_command_trains_on_apartments(
     assert card["accuracy"]["start"] > 2.5 / len(names)
     assert card["accuracy"]["start + 3 perfect"] > 2.5 / len(names)
     assert out.stat().st_size < 2 * 2**20
-    assert card["scenes"] == "apartments:train:2"
+    assert card["scenes"] == "apartments:train:2" and 0 < card["hard_sets"] <= 10
+    assert set(card["accuracy_hard"]) == set(card["accuracy"])
 
     made = sorted(cache.iterdir())  # the second time nothing is looked at anew, but what was damaged
-    assert [file.suffix for file in made] == [".npz"] * 3
+    assert [file.suffix for file in made] == [".npz"] * 6, "of three scenes, as they come and with a hard first look"
     whole = [file.read_bytes() for file in made]
     made[0].write_bytes(whole[0][:1000])
     before = made[2].stat().st_mtime_ns

@@ -5,7 +5,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 from wiw.analysis.statistics import Difference, Estimate, adjust_p_values, compare, estimate_mean
@@ -14,6 +14,10 @@ from wiw.types import Episode
 
 Done = Mapping[str, Mapping[int, Mapping[str, Any]]]
 """By arm, scored episodes by index with "scene", "metrics", and "task" where there are kinds."""
+PRIMITIVES, DECISIONS = "primitives", "decisions"
+"""What cuts of an anytime curve count."""
+MOST_CUTS = 10
+"""Most cuts of an anytime curve over decisions."""
 BOTH, ONE, NEITHER = "both right", "one right", "neither right"
 PAIRS = Metric("twins", "Twins", "rate", True, about="Percent of pairs of twins of which both are answered rightly.")
 
@@ -42,11 +46,18 @@ class Breakdown:
     """Unit that estimates are means over."""
     shown: frozenset[tuple[str, str]] = frozenset()
     """Row and column of the differences that the test, adjusted for all of the table, finds."""
+    cut_unit: str = ""
+    """What cuts count, "primitives" or "decisions"; empty where keys are no cuts."""
 
     @property
     def keys(self) -> tuple[str, ...]:
         """All keys, in order."""
         return tuple(dict.fromkeys(key for found in self.estimates.values() for key in found))
+
+    @property
+    def stands_in_terminal(self) -> bool:
+        """Whether it belongs to the tables in a terminal; that of decisions is wide, and for pages and exports."""
+        return self.cut_unit != DECISIONS
 
     @property
     def columns(self) -> tuple[str, ...]:
@@ -116,66 +127,124 @@ def split_by_kind(done: Done, metrics: Sequence[Metric], kind: str, seed: int) -
     return found
 
 
-def read_anytime_curve(done: Done, cuts: Sequence[int], metric: Metric, seed: int) -> list[Breakdown]:
-    """Return the score of each arm if every episode had been cut after so many primitives; none without cuts.
+@dataclass(frozen=True)
+class Cuts:
+    """Where the anytime curve of a run is read."""
+
+    at: tuple[int, ...]
+    unit: str
+    """`PRIMITIVES` or `DECISIONS`."""
+    metric: Metric
+    """The score that is cut."""
+    about: str
+
+    def name_metric(self, cut: int) -> str:
+        """Return the name that the score at a cut has among an episode's metrics."""
+        return f"{'score' if self.unit == PRIMITIVES else self.metric.name}_at_{cut}"
+
+    def make_metric(self, cut: int) -> Metric:
+        """Return the score at a cut as a metric."""
+        return replace(self.metric, name=self.name_metric(cut), of=None)
+
+
+def cut_by_primitives(at: Sequence[int], metric: Metric) -> Cuts:
+    """Return cuts after so many primitives, at which the task has measured the score."""
+    about = "What is not answered by then counts as the best guess from the question's text alone."
+    return Cuts(tuple(at), PRIMITIVES, metric, about)
+
+
+def cut_by_decisions(done: Done) -> tuple[Done, Cuts | None]:
+    """Return episodes that have their success after so many decisions among the metrics, and these cuts.
+
+    Where an episode's details say whether what was answered at each decision is right ("right_after"), that is its
+    success; else it has succeeded from its last decision on, if at all. Runs of a single decision have no cuts.
+    """
+    counts = [o["metrics"].get("decisions", 0) for ended in done.values() for o in ended.values()]
+    budget = int(max(counts, default=0))
+    if budget < 2:
+        return done, None
+    spacing = -(-budget // MOST_CUTS)
+    cuts = Cuts(
+        tuple(sorted({1, *range(spacing, budget, spacing), budget})),
+        DECISIONS,
+        SUCCESS,
+        "An episode that ended before keeps its outcome.",
+    )
+    return {arm: {i: _add_cuts(o, cuts) for i, o in ended.items()} for arm, ended in done.items()}, cuts
+
+
+def _add_cuts(outcome: Mapping[str, Any], cuts: Cuts) -> Mapping[str, Any]:
+    metrics = outcome["metrics"]
+    if not {"success", "decisions"} <= metrics.keys():
+        return outcome
+    right = outcome.get("details", {}).get("right_after")
+    found = {
+        cuts.name_metric(cut): float(right[min(cut, len(right)) - 1])
+        if right
+        else float(metrics["success"] and metrics["decisions"] <= cut)
+        for cut in cuts.at
+    }
+    return {**outcome, "metrics": {**metrics, **found}}
+
+
+def read_anytime_curve(done: Done, cuts: Cuts, seed: int) -> list[Breakdown]:
+    """Return the score of each arm if every episode had been cut there; none where arms lack it.
 
     Args:
-        done: see `Done`; "score_at_30" and so on among the metrics.
-        cuts: primitives.
-        metric: the score that is cut.
+        done: see `Done`, with the scores at the cuts among the metrics.
+        cuts: where, and which score.
         seed: of the bootstrap.
     """
     estimates: dict[str, dict[str, Estimate]] = {}
     for arm, ended in done.items():
-        for cut in cuts:
-            at = _make_cut_metric(metric, cut)
+        for cut in cuts.at:
+            at = cuts.make_metric(cut)
             if ended and all(at.name in o["metrics"] for o in ended.values()):
                 estimates.setdefault(arm, {})[str(cut)] = _estimate(list(ended.values()), at, seed)
-    about = "What is not answered by then counts as the best guess from the question's text alone."
-    title = f"{_title(metric)} if cut after so many primitives"
-    heading = f"{metric.label} if cut after so many primitives"
-    return [Breakdown("anytime", title, heading, about, "cut", metric, estimates)] if estimates else []
+    title = f"{_title(cuts.metric)} if cut after so many {cuts.unit}"
+    heading = f"{cuts.metric.label} if cut after so many {cuts.unit}"
+    found = Breakdown("anytime", title, heading, cuts.about, "cut", cuts.metric, estimates, cut_unit=cuts.unit)
+    return [found] if estimates else []
 
 
-def compare_anytime_curves(
-    done: Done, pairs: Iterable[tuple[str, str]], cuts: Sequence[int], metric: Metric, seed: int
-) -> list[Breakdown]:
+def compare_anytime_curves(done: Done, pairs: Iterable[tuple[str, str]], cuts: Cuts, seed: int) -> list[Breakdown]:
     """Return paired differences of the anytime curve, a table per base.
 
     Args:
-        done: see `Done`.
+        done: see `Done`, with the scores at the cuts among the metrics.
         pairs: arms and what each is compared with.
-        cuts: primitives.
-        metric: the score that is cut.
+        cuts: where, and which score.
         seed: of the bootstrap.
     """
     found: dict[str, dict[tuple[str, str], Difference]] = {}
     for arm, base in pairs:
-        for cut in cuts:
-            at = _make_cut_metric(metric, cut)
+        for cut in cuts.at:
+            at = cuts.make_metric(cut)
             both = [o["metrics"] for name in (arm, base) for o in done[name].values()]
             difference = compare(arm, base, done, at, seed) if all(at.name in each for each in both) else None
             if difference is not None:
                 found.setdefault(base, {})[arm, str(cut)] = difference
-    return [_tabulate_anytime_differences(base, cells, metric) for base, cells in found.items()]
+    return [_tabulate_anytime_differences(base, cells, cuts) for base, cells in found.items()]
 
 
-def _tabulate_anytime_differences(base: str, cells: Mapping[tuple[str, str], Difference], metric: Metric) -> Breakdown:
+def _tabulate_anytime_differences(base: str, cells: Mapping[tuple[str, str], Difference], cuts: Cuts) -> Breakdown:
     """Return the table of differences from one base, by arm and cut."""
     estimates: dict[str, dict[str, Estimate]] = {}
     for (arm, cut), difference in cells.items():
         estimates.setdefault(arm, {})[cut] = difference.estimate
     adjusted = zip(cells, adjust_p_values(list(cells.values())), strict=True)
+    heading = f"{cuts.metric.label} if cut after so many {cuts.unit}, difference from {base}"
     return Breakdown(
         "anytime_differences",
-        f"{metric.label} if cut, difference from {base}, points",
-        f"{metric.label} if cut, difference from {base}",
+        f"{heading}, points",
+        heading,
         "Paired by episode.",
         "cut",
-        metric,
+        cuts.metric,
         estimates,
         base,
         shown=frozenset(cell for cell, difference in adjusted if difference.is_shown),
+        cut_unit=cuts.unit,
     )
 
 
@@ -217,10 +286,6 @@ def find_twins(episodes: Sequence[Episode]) -> list[tuple[int, int]]:
 def _read_twin(episode: Episode) -> str:
     question = episode.info.get("question")
     return str(question.get("twin") or "") if isinstance(question, Mapping) else ""
-
-
-def _make_cut_metric(metric: Metric, cut: int) -> Metric:
-    return Metric(f"score_at_{cut}", metric.label, metric.kind, metric.higher_is_better, least=metric.least)
 
 
 def _estimate(outcomes: Sequence[Mapping[str, Any]], metric: Metric, seed: int) -> Estimate:

@@ -13,7 +13,10 @@ from typing import Any
 
 from wiw.analysis.breakdowns import (
     Breakdown,
+    Cuts,
     compare_anytime_curves,
+    cut_by_decisions,
+    cut_by_primitives,
     find_twins,
     read_anytime_curve,
     score_twins,
@@ -457,13 +460,28 @@ def _break_down(
     seed: int,
 ) -> tuple[Breakdown, ...]:
     known = {metric.name: _label(metric, marks) for metric in load_metrics()}
-    score = _label(ANSWER_SCORE, marks)
     return (
         *split_by_kind(done, [known[name] for name in tables.kinds if name in known], tables.kind, seed),
-        *read_anytime_curve(done, tables.cuts, score, seed),
-        *compare_anytime_curves(done, pairs, tables.cuts, score, seed),
+        *_cut_episodes(done, pairs, tables, marks, seed),
         *score_twins(done, twins, seed),
     )
+
+
+def _cut_episodes(
+    done: Mapping[str, Mapping[int, Mapping[str, Any]]],
+    pairs: Sequence[tuple[str, str]],
+    tables: TableSpec,
+    marks: Marks | None,
+    seed: int,
+) -> tuple[Breakdown, ...]:
+    """Return the anytime curve, over primitives where the task names cuts, else over decisions, and its differences."""
+    if tables.cuts:
+        cuts: Cuts | None = cut_by_primitives(tables.cuts, _label(ANSWER_SCORE, marks))
+    else:
+        done, cuts = cut_by_decisions(done)
+    if cuts is None:
+        return ()
+    return (*read_anytime_curve(done, cuts, seed), *compare_anytime_curves(done, pairs, cuts, seed))
 
 
 def _label(metric: Metric, marks: Marks | None) -> Metric:

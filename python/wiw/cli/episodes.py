@@ -16,6 +16,7 @@ def episodes(
     /,
     *,
     out: Annotated[Path, arg(metavar="FILE")] = Path("episodes.json.gz"),
+    preset: Annotated[str | None, arg(metavar="NAME|FILE")] = None,
     scenes: Annotated[str | None, arg(metavar="SPEC")] = None,
     episodes: Annotated[int, arg(metavar="N")] = 20,
     per_scene: Annotated[int | None, arg(metavar="N")] = None,
@@ -35,12 +36,14 @@ def episodes(
     $ wiw episodes aeqa --scenes house.world --attributes house.json --episodes 40 --out house_questions.json
     $ wiw episodes imagenav --tier beyond --scenes apartments:test:12 --episodes 60 --out beyond.json.gz
     $ wiw episodes ar --task-option categories=bed,sofa,desk --out three.json
+    $ wiw episodes ar --preset foresight --scenes apartments:val:12 --episodes 60 --out hard.json.gz
 
     Scenes inside the file's folder are named by relative paths, so that the folder can be moved or shared.
 
     Args:
         task: See `wiw list`.
         out: JSON; gzipped if the name ends in .gz.
+        preset: Whose rules the episodes satisfy, such as foresight of ar; default if not given. See `wiw list presets`.
         scenes: apartments:train|val|test[[:FIRST]:END], a mesh (GLB, glTF, OBJ, PLY, DAE), or a Gazebo world;
             apartments:val if not given.
         episodes: Number of episodes.
@@ -64,7 +67,8 @@ def episodes(
     if out.exists() and not overwrite:
         raise ArgumentError(f"{out} is there already; give --overwrite to replace it, or another name with --out")
     more = {} if attributes is None else {"attributes": str(attributes)}
-    flags = {"scenes": scenes, "seed": seed, "backend": backend, "per_scene": per_scene, "tier": tier, **more}
+    rules = {"preset": preset, "tier": tier, "per_scene": per_scene, **more}
+    flags = {"scenes": scenes, "seed": seed, "backend": backend, **rules}
     made = TASKS.make(task, **task_options(task, task_option, flags))
     if made.file_header is None:
         raise ArgumentError(

@@ -53,8 +53,8 @@ class TaskFlags:
     robot: Annotated[Path | None, arg(metavar="URDF")] = None
     """For manipulation: description of an arm to work with; the Franka Panda, of simple shapes, if not given."""
     preset: Annotated[str | None, arg(metavar="NAME|FILE")] = None
-    """All that a number depends on: default, paper, official (its published code), or a YAML file of your own; what the
-    command line says goes before it. See `wiw list presets`."""
+    """All that a number depends on: default, paper, official (its published code), foresight (of ar), or a YAML file of
+    your own; what the command line says goes before it. See `wiw list presets`."""
     task_option: Options = ()
     """A rule of the preset, such as decisions=10, or another option of the task, such as categories=bed,sofa; may be
     given again."""

@@ -11,16 +11,25 @@ from wiw.tasks.presets import DEFAULT, Preset, load_preset
 
 
 def list_settings(task: str, preset: str | Path) -> list[str]:
-    """Return what a preset sets otherwise than the default: a line for rules, and one for each policy and model."""
+    """Return what a preset sets otherwise than the default: a line for rules, for generated episodes, and one for each
+    policy and model.
+    """
     ours, base = load_preset(task, preset), load_preset(task, DEFAULT)
-    rules = _list_changes(ours.rules, base.rules)
+    general = [
+        f"{title}: {changes}"
+        for title, own, others in (
+            ("rules", ours.rules, base.rules),
+            ("generated episodes", ours.generator, base.generator),
+        )
+        if (changes := _list_changes(own, others))
+    ]
     parts = [
         f"{name}: {changes}"
         for kind in ("policies", "models")
         for name, options in getattr(ours, kind).items()
         if (changes := _list_changes(options, getattr(base, kind).get(name, {})))
     ]
-    return [*([f"rules: {rules}"] if rules else []), *parts]
+    return [*general, *parts]
 
 
 def list_reasons(task: str, preset: str | Path) -> Iterator[str]:

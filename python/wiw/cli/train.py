@@ -6,7 +6,7 @@ from __future__ import annotations
 import math
 import sys
 from collections.abc import Mapping
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
@@ -20,7 +20,7 @@ from wiw.training.launcher import ProcessLayout, require_single_process
 
 ONE_PROCESS = ProcessLayout()
 DEFAULT_SCENES, DEFAULT_VAL, DEFAULT_PLAYS, DEFAULT_WORKERS = "apartments:train:80", "apartments:val:20", 2000, 2
-PERCEPTION_SCENES = "apartments:train:160"
+MORE_SCENES = "apartments:train:160"
 ON_SCENES, ON_PLAYS, ON_DEMONSTRATIONS = ("recogniser", "warpnet", "perception"), ("armnet",), ("armnet", "diffuser")
 ON_DATA = (*VIDEO, "pocket")
 USES: Mapping[str, tuple[tuple[str, ...], str]] = {
@@ -34,7 +34,7 @@ USES: Mapping[str, tuple[tuple[str, ...], str]] = {
     "cache": ((*ON_SCENES, *ON_PLAYS, *ON_DATA), "caches no training data"),
     "minutes": ((*ON_SCENES, *ON_PLAYS, "diffuser"), "has no time limit, but --option clips=N"),
     "data": (ON_DATA, "trains on other data"),
-    "weights": (VIDEO, "begins with random weights"),
+    "weights": ((*VIDEO, "recogniser"), "begins with random weights"),
     "recipe": (ON_DATA, "reads no recipe"),
     "option": (ON_DATA, "reads no recipe"),
     "device": (VIDEO, "trains on the CPU"),
@@ -131,7 +131,7 @@ def train(
     states and of colour words on the val scenes; for armnet, errors on held-out plays, beside copy and a table where
     nothing but the arm moves. diffuser is not evaluated. The weights shipped with wiw were trained by this command with
     its defaults; those of perception for four epochs of a schedule that was first laid out for six
-    (docs/perception.md), those of pocket on 16 800 clips.
+    (docs/perception.md), those of pocket on 16 800 clips, those of recogniser by an earlier recipe (docs/results.md).
 
     Args:
         what: recogniser, warpnet, pocket, perception, armnet, diffuser or a video model.
@@ -140,7 +140,8 @@ def train(
         data: Dataset for pocket and video models: a folder of `wiw collect navigation`; for video models also of `wiw
             collect manipulation`.
         weights: Pretrained weights that a video model begins with: a folder as save_pretrained writes it, or a name on
-            the Hugging Face hub. Default: those of the world model.
+            the Hugging Face hub. Default: those of the world model. For recogniser a file of this command, whose
+            training goes on. Default: none.
         recipe: YAML file with numbers of the recipe of pocket or a video model, on top of the shipped ones.
         option: Number of such a recipe, such as rate=2e-5, clips=1600 or batch=8; may be given again. See
             `wiw.training.post_training.recipe.PostTrainingRecipe` and `wiw.training.pocket.recipe.PocketRecipe`.
@@ -154,7 +155,7 @@ def train(
         tracker: Program that draws loss and validation of pocket or a video model; needs its package.
             OUT.log/metrics.jsonl has the same in any case.
         scenes: Training scenes of recogniser, warpnet and perception: apartments:train[:N], a mesh or a Gazebo world.
-            Default: apartments:train:80; 160 of them for perception.
+            Default: apartments:train:160; 80 of them for warpnet.
         val: Held-out scenes of recogniser, warpnet, pocket and perception. recogniser splits them, or the samples of a
             single one, into halves for calibration and evaluation. Default: apartments:val:20.
         categories: What recogniser tells apart. Default: the built-in list of 26 categories.
@@ -162,7 +163,7 @@ def train(
         epochs: How often each sample is used, on average. Default: 25 for recogniser, 6 for warpnet, 1 for pocket, 4
             for perception and armnet, 400 for diffuser.
         minutes: Train fewer epochs if all of them would take longer than this.
-        places: Places sampled in each scene, for recogniser (default: 16) and perception (default: 12), or walks
+        places: Places sampled in each scene, for recogniser (default: 8) and perception (default: 12), or walks
             recorded in each scene, for warpnet (default: 24).
         plays: Simulated plays of armnet, of eight gripper poses each. Default: 2000.
         seed: Seed of the training data and of the weights.
@@ -199,7 +200,7 @@ def train(
     _require_torch(what)
     _check_out(out)
     source = _DataOptions(
-        scenes=scenes or (PERCEPTION_SCENES if what == "perception" else DEFAULT_SCENES),
+        scenes=scenes or (DEFAULT_SCENES if what == "warpnet" else MORE_SCENES),
         val=DEFAULT_VAL if val is None else val,
         seed=seed,
         cache=cache or folder().parent / "looks",
@@ -210,7 +211,7 @@ def train(
         _check_scenes(source.scenes, source.val)
     with announce_resume():
         if what == "recogniser":
-            _train_recogniser(out, source, categories, minutes, rules, lengths)
+            _train_recogniser(out, source, weights, categories, minutes, rules, lengths)
         elif what == "diffuser":
             _train_diffuser(out, demonstrations, minutes, {**lengths, "seed": seed})
         elif what == "armnet":
@@ -266,28 +267,38 @@ def _require_torch(what: str) -> None:
 def _train_recogniser(
     out: Path,
     data: _DataOptions,
+    weights: str | None,
     categories: tuple[str, ...],
     minutes: float | None,
     rule_options: dict[str, Any],
     recipe_options: dict[str, Any],
 ) -> None:
     from wiw.datasets.ar import CATEGORIES
+    from wiw.perception.recogniser import Recogniser
     from wiw.training import recogniser as training
-    from wiw.training.gather import gather_glimpse_sets
-    from wiw.training.glimpse_sets import GlimpseSetRules, split_in_half
+    from wiw.training.gather import gather_glimpse_sets, gather_hard_sets
+    from wiw.training.glimpse_sets import GlimpseSetRules, merge_glimpse_sets, split_in_half
 
     names, rules, recipe = (
         categories or CATEGORIES,
         GlimpseSetRules(**rule_options),
         training.Recipe(seed=data.seed, **recipe_options),
     )
+    start = None if weights is None else Recogniser.load(weights)
     looks = gather_glimpse_sets(data.scenes, names, data.seed, rules, **data.gathering)
-    calibration, held_out = split_in_half(gather_glimpse_sets(data.val, names, data.seed, rules, **data.gathering))
+    hard = gather_hard_sets(data.scenes, names, data.seed, **data.gathering)
+    as_they_are = replace(rules, reshape=1.0)
+    held_out = gather_glimpse_sets(data.val, names, data.seed, as_they_are, **data.gathering)
+    calibration, held_out = split_in_half(held_out)
+    held_out_hard = gather_hard_sets(data.val, names, data.seed, **data.gathering)
+    samples = merge_glimpse_sets([looks, *[hard] * recipe.hard])
     with _StepBar() as steps:
-        network, recipe = training.train(looks, names, recipe, minutes, steps)
-    card = {"scenes": data.scenes, "val": data.val, "sets": len(looks)}
-    card |= {"looks": asdict(rules), "recipe": asdict(recipe)}
-    calibrated = training.calibrate(network, names, calibration, held_out, card)
+        network, recipe = training.train(
+            samples, names, recipe, minutes, steps, None if start is None else start.network
+        )
+    card = {"scenes": data.scenes, "val": data.val, "sets": len(looks), "hard_sets": len(hard)}
+    card |= {"looks": asdict(rules), "recipe": asdict(recipe), "began_with": None if start is None else start.card}
+    calibrated = training.calibrate(network, names, calibration, held_out, card, held_out_hard)
     calibrated.save(out)
     _report_recogniser(calibrated.card, calibrated.temperature)
 
@@ -482,7 +493,11 @@ def _check_scenes(scenes: str, val: str) -> None:
 def _report_recogniser(card: dict[str, Any], temperature: float) -> None:
     print(f"{card['sets']} glimpse sets, {card['recipe']['epochs']} epochs; held out: {card['held_out_sets']} sets")
     for name, accuracy in card["accuracy"].items():
-        print(f"  {name:<20} accuracy {100 * accuracy:5.1f} %")
+        hard = card["accuracy_hard"].get(name)
+        print(
+            f"  {name:<20} accuracy {100 * accuracy:5.1f} %"
+            + (f", hard {100 * hard:5.1f} %" if hard is not None else "")
+        )
     error = card["calibration_error"]
     print(f"calibration error {error['before']:.3f}, at temperature {temperature:.2f} {error['after']:.3f}")
 

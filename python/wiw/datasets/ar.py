@@ -3,6 +3,7 @@
 
 A thing is hardly seen when most of it is hidden, or when it is so far away or so foreshortened that little is to be
 seen, a small part of what a good view shows; both are measured in rendered instance ids (`wiw.datasets.visibility`).
+Or it is averted: seen from the side or from behind, where it has a front. No recogniser is asked.
 """
 
 from __future__ import annotations
@@ -11,7 +12,7 @@ from collections import Counter
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
 import numpy as np
 from numpy.typing import NDArray
@@ -101,6 +102,12 @@ ALIASES = {
 }
 """Other scenes' words for the apartments' categories."""
 
+HIDDEN_LOOK, SMALL_LOOK, AVERTED_LOOK = "hidden", "small", "averted"
+"""Why a first look is hard."""
+FIRST_LOOKS = (HIDDEN_LOOK, SMALL_LOOK, AVERTED_LOOK)
+FRONTLESS = ("bin", "floor lamp", "laundry basket", "plant", "stool", "table lamp")
+"""Categories that look alike from all sides."""
+
 LABELS_NEEDED = "put the files with its labels beside its mesh (docs/real-scans.md)"
 HIDDEN = (0.4, 0.2)
 """Visible shares at the start below which an episode is of difficulty 1 and 2."""
@@ -139,6 +146,14 @@ class EpisodeRules:
     """Places near a target where its visible share is measured."""
     attempts: int = 6
     """Starts tried for a target."""
+    first_look: Literal["any", "balanced"] = "any"
+    """any: hidden or small, as they come; balanced: hidden, small and averted take turns."""
+    averted: float = 70.0
+    """Averted: least degrees between the target's front and the direction to the start ..."""
+    facing: float = 55.0
+    """... and most degrees between its front and the direction to the best view ..."""
+    nearby: float = 3.0
+    """... from at most this far away, so that it is hard for its side alone."""
 
 
 @dataclass(frozen=True)
@@ -198,10 +213,12 @@ def generate(
     survey = Survey(points, measure_sizes(world, points, COARSE))
     made: list[Episode] = []
     tally = Counter(before)
-    for round_ in range(count):
+    balanced = rules.first_look == "balanced"
+    for round_ in range(count + len(FIRST_LOOKS) if balanced else count):
         for number, category in enumerate(_order(things, tally, core.fold_key([key, round_]))):
             draw = core.fold_key([key, round_, number])
-            episode = _episode(world, survey, things[category], draw, rules, made)
+            look = _choose_look(tally.total(), round_) if balanced else None
+            episode = _episode(world, survey, things[category], draw, rules, made, look)
             if episode is not None:
                 made.append(episode)
                 tally[category] += 1
@@ -210,6 +227,11 @@ def generate(
     raise ArgumentError(
         f"{world.name}: only {len(made)} of {count} targets and starts satisfy {rules}; ask for fewer in a scene"
     )
+
+
+def _choose_look(number: int, round_: int) -> str | None:
+    """Return the look whose turn it is: where a round did not find it, the next one, and in the end any."""
+    return FIRST_LOOKS[(number + round_) % len(FIRST_LOOKS)] if round_ < len(FIRST_LOOKS) else None
 
 
 def _targets(world: World, categories: Sequence[str]) -> dict[str, list[Mapping[str, Any]]]:
@@ -240,24 +262,37 @@ def _episode(
     key: int,
     rules: EpisodeRules,
     made: Sequence[Episode],
+    look: str | None,
 ) -> Episode | None:
     """Return an episode with one of the instances as target, if one has a start that is hard and can be mended.
 
-    Never from where the same target is looked at in one of those `made`.
+    Never from where the same target is looked at in one of those `made`; if `look` is given, it is hard for that
+    reason.
     """
     draws = core.uniform(key, 2)
     instance = instances[int(draws[0] * len(instances))]
     name, centre = int(instance["id"]), np.asarray(instance["bounds"], np.float64).mean(axis=0)
-    for start, size, share in _starts(world, survey, name, centre, core.fold_key([key, 1]), rules):
+    front = find_front(world, instance)
+    if look == AVERTED_LOOK and front is None:
+        return None
+    for start, size, share in _starts(world, survey, instance, core.fold_key([key, 1]), rules, look):
         if any(name == other.info["target"] and _triple(start) == other.start_position for other in made):
             continue
         ahead = np.arctan2(-(centre - start)[0], -(centre - start)[2])
         yaw = float(ahead + np.radians(rules.turned) * (2 * draws[1] - 1)) % (2 * np.pi)
-        best = _best_view(world, start, yaw, name, rules)
-        if best is None or best.size < rules.gain * size:
+        averted = share > rules.hidden and bool(_are_averted(start, centre, front, rules))
+        best = _best_view(world, start, yaw, name, rules, (centre, front) if averted and front is not None else None)
+        reason = None if best is None else _find_reason(size, share, averted, best, rules)
+        if best is None or reason is None or look not in (None, reason):
             continue
-        if share > rules.hidden and (size > rules.small * best.size or size > rules.tiny):
-            continue
+        angles = (
+            {}
+            if front is None
+            else {
+                "view_angle_deg": round(float(_measure_view_angles(start, centre, front)), 1),
+                "best_view_angle_deg": round(float(_measure_view_angles(best.position, centre, front)), 1),
+            }
+        )
         return Episode(
             episode_id="",
             scene=world.name,
@@ -274,25 +309,87 @@ def _episode(
                 "best_position": _triple(best.position),
                 "best_primitives": best.primitives,
                 "best_visible": round(best.share, 4),
+                **({"first_look": reason, **angles} if rules.first_look == "balanced" else {}),
             },
         )
     return None
 
 
+def _find_reason(size: float, share: float, averted: bool, best: _View, rules: EpisodeRules) -> str | None:
+    """Return why a first look is hard where the best view mends it; None where it is not, or where that does not."""
+    if averted:
+        return AVERTED_LOOK
+    if best.size < rules.gain * size:
+        return None
+    if share <= rules.hidden:
+        return HIDDEN_LOOK
+    return SMALL_LOOK if size <= rules.small * best.size and size <= rules.tiny else None
+
+
+def find_front(world: World, instance: Mapping[str, Any]) -> NDArray[np.float64] | None:
+    """Return the horizontal direction that an instance faces, float64 [3] of unit length.
+
+    None where it is not known: in scenes other than the generated apartments, whose furniture is built to face its own
+    +z, and of things that look alike from all sides.
+    """
+    if "layout" not in world.scene.attributes or category_of(instance) in FRONTLESS:
+        return None
+    ahead = np.asarray(instance["T_world_instance"], np.float64)[:3, 2] * [1.0, 0.0, 1.0]
+    length = float(np.linalg.norm(ahead))
+    return ahead / length if length > 0.5 else None  # less than 30 degrees off the vertical, it faces up or down
+
+
+def _measure_view_angles(
+    places: NDArray[np.float64], centre: NDArray[np.float64], front: NDArray[np.float64]
+) -> NDArray[np.float64]:
+    """Return the degrees, 0 to 180, between a target's front and the horizontal directions to places [..., 3]."""
+    ways = (places - centre) * [1.0, 0.0, 1.0]
+    cosines = ways @ front / np.maximum(np.linalg.norm(ways, axis=-1), 1e-9)
+    return np.asarray(np.degrees(np.arccos(np.clip(cosines, -1, 1))))
+
+
+def _are_averted(
+    places: NDArray[np.float64], centre: NDArray[np.float64], front: NDArray[np.float64] | None, rules: EpisodeRules
+) -> NDArray[np.bool_]:
+    """Return whether a target is seen from the side or from behind at places [..., 3], and from nearby."""
+    if rules.first_look != "balanced" or front is None:
+        return np.zeros(places.shape[:-1], bool)
+    away = np.hypot(*np.moveaxis((places - centre)[..., [0, 2]], -1, 0))
+    return np.asarray((away <= rules.nearby) & (_measure_view_angles(places, centre, front) >= rules.averted))
+
+
 def _starts(
-    world: World, survey: Survey, instance: int, centre: NDArray[np.float64], key: int, rules: EpisodeRules
+    world: World,
+    survey: Survey,
+    target: Mapping[str, Any],
+    key: int,
+    rules: EpisodeRules,
+    look: str | None,
 ) -> Iterator[tuple[NDArray[np.float64], float, float]]:
-    """Yield places from which at least a little of the target is seen, with its size and visible share there."""
+    """Yield places from which at least a little of the target is seen, with its size and visible share there.
+
+    Only those that may be hard by the `look`; without one all, those where it is hidden first.
+    """
+    instance, centre = int(target["id"]), np.asarray(target["bounds"], np.float64).mean(axis=0)
     away = np.hypot(*(survey.points - centre)[:, [0, 2]].T)
-    near = np.flatnonzero((away >= rules.nearest) & (away <= rules.farthest) & (survey.sizes[:, instance] > 0))
-    if not len(near):
+    near = (away >= rules.nearest) & (away <= rules.farthest) & (survey.sizes[:, instance] > 0)
+    if look == SMALL_LOOK:
+        near &= survey.sizes[:, instance] <= 1.2 * rules.tiny  # which is a rough measure
+    elif look == AVERTED_LOOK:
+        near &= _are_averted(survey.points, centre, find_front(world, target), rules)
+    close = np.flatnonzero(near)
+    if not len(close):
         return
-    points = survey.points[near[np.argsort(core.uniform(key, len(near)))][: rules.places]]
+    points = survey.points[close[np.argsort(core.uniform(key, len(close)))][: rules.places]]
     sizes = measure_sizes(world, points)[:, instance]
     points, sizes = points[sizes >= rules.seen], sizes[sizes >= rules.seen]
     shares = np.minimum(1.0, sizes / np.maximum(measure_unoccluded_sizes(world, points, instance), 1e-9))
-    # The hidden ones first; the others have to be far or foreshortened, which only the best view tells.
-    for i in np.argsort(shares > rules.hidden, kind="stable")[: rules.attempts]:
+    # The hidden ones first, unless another look is asked for; those that are far or foreshortened only the best view
+    # tells.
+    later = shares > rules.hidden if look in (None, HIDDEN_LOOK) else shares <= rules.hidden
+    for i in np.argsort(later, kind="stable")[: rules.attempts]:
+        if look is not None and later[i]:
+            return
         yield points[i], float(sizes[i]), float(shares[i])
 
 
@@ -305,13 +402,24 @@ class _View:
 
 
 def _best_view(
-    world: World, start: NDArray[np.float64], yaw: float, instance: int, rules: EpisodeRules
+    world: World,
+    start: NDArray[np.float64],
+    yaw: float,
+    instance: int,
+    rules: EpisodeRules,
+    facing: tuple[NDArray[np.float64], NDArray[np.float64]] | None = None,
 ) -> _View | None:
     """Return where within the budget the target is seen largest, among places where it is seen clearly.
 
-    Of those where it is large enough, it is the one with the greatest visible share.
+    Of those where it is large enough, it is the one with the greatest visible share. With its centre and its front
+    given in `facing`, it is one from which the front is seen.
     """
     ends, primitives = _reachable(world, start, yaw, rules.budget)
+    if facing is not None:
+        seen = _measure_view_angles(ends, *facing) <= rules.facing
+        ends, primitives = ends[seen], primitives[seen]
+    if not len(ends):
+        return None
     rough = measure_sizes(world, ends, COARSE)[:, instance]
     largest = np.argsort(-np.minimum(rough, rules.enough), kind="stable")[:6]
     largest = largest[rough[largest] >= rules.large / 2]

@@ -12,6 +12,7 @@ from typing import Any
 from markupsafe import Markup
 
 from wiw.analysis.blame import Blame, read_blame
+from wiw.analysis.breakdowns import DECISIONS
 from wiw.analysis.costs import cost_columns, costs
 from wiw.analysis.fidelity import ArmFidelity, choose_columns, fidelity
 from wiw.analysis.marks import BLIND
@@ -247,7 +248,6 @@ def _plots(
         return []
     words = wording(run.store)
     found = _plot_anytime_curves(summary)
-    budget = int(max(row["metrics"].get("decisions", 0) for rows in done.values() for row in rows))
     about = "Bars are 95 % intervals; dashed lines mark the floor (copy) and the oracle."
     found.append(("Success by arm", about, plots.success_by_arm(summary)))
     ways = {arm: [row for row in rows if row["geodesic"] is not None] for arm, rows in done.items()}
@@ -256,9 +256,6 @@ def _plots(
         if plots.shows_single_outcomes(ways):
             about += f" A circle per episode; filled: {words.won}, hollow: {words.lost}."
         found.append(("Success by distance", about, plots.success_by_distance(ways, words)))
-    if budget:
-        about = "Share of episodes that have succeeded after a number of decisions."
-        found.append(("Decisions to success", about, plots.decisions_to_success(done, budget, words)))
     if sum(not math.isnan(line.rank) for line in truths) > 1:
         about = "Does an arm that ranks plans correctly also succeed? Kendall's tau against the true futures."
         found.append(("Rank agreement and success", about, plots.success_by_rank(truths, summary)))
@@ -276,7 +273,8 @@ def _plot_anytime_curves(summary: Summary) -> list[tuple[str, str, Markup]]:
             about = "Score if every episode had been cut there; bands are 95 % intervals."
             if BLIND in curve.estimates:
                 about += " Dashed: the best guess from the question's text, which counts where nothing is answered."
-            found.append(("Score by budget", about, plots.anytime_curve(curve)))
+            title = "Success by decisions" if curve.cut_unit == DECISIONS else "Score by budget"
+            found.append((title, about, plots.anytime_curve(curve)))
         elif curve.name == "anytime_differences":
             about = "Paired by episode, if every episode had been cut there; bands are 95 % intervals."
             found.append((f"Gain over {curve.base} by budget", about, plots.anytime_differences(curve)))

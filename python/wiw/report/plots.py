@@ -27,6 +27,7 @@ from wiw.analysis.intervals import wilson
 from wiw.analysis.marks import BLIND
 from wiw.analysis.quality import QualityTable
 from wiw.analysis.summary import Summary
+from wiw.metrics.metric import SUCCESS
 from wiw.types import Wording
 
 LONGEST_LINE = 16
@@ -401,26 +402,8 @@ def _draw_binned_rates(axes: Axes, outcomes: Outcomes, colors: Mapping[str, str]
     _legend(axes)
 
 
-def decisions_to_success(outcomes: Outcomes, budget: int, words: Wording) -> Markup:
-    """Plot the share of episodes that have succeeded after a number of decisions."""
-    colors = arm_colors(list(outcomes))
-    figure, axes = _figure()
-    for arm, rows in outcomes.items():
-        taken = np.sort([row["metrics"]["decisions"] for row in rows if row["metrics"].get("success")])
-        share = 100 * np.arange(1, len(taken) + 1) / max(1, len(rows))
-        x, y = np.concatenate([[0], taken, [budget]]), np.concatenate([[0], share, [share[-1] if len(share) else 0]])
-        axes.step(x, y, where="post", color=colors[arm], lw=2.2, label=arm)
-    axes.set_xlim(0, budget + 0.3)
-    axes.xaxis.set_major_locator(MaxNLocator(TICKS, integer=True))
-    axes.set_ylim(-3, 103)
-    axes.set_xlabel("decisions")
-    axes.set_ylabel(f"{words.succeeded}, %")
-    _legend(axes)
-    return _svg(figure, "decisions-to-success")
-
-
 def anytime_curve(found: Breakdown) -> Markup:
-    """Plot the score if episodes are cut after a number of primitives, with bands; blind answers as a dashed line."""
+    """Plot the score if episodes are cut after so many primitives or decisions, with bands; blind answers dashed."""
     figure, axes = _figure()
     colors, cuts = arm_colors(list(found.estimates)), [int(key) for key in found.keys]
     blind = found.estimates.get(BLIND)
@@ -433,23 +416,27 @@ def anytime_curve(found: Breakdown) -> Markup:
             if arm != BLIND and first.n == blind[str(cuts[0])].n:  # nothing is answered before anything is done
                 axes.plot([0, cuts[0]], [level, first.value], color=colors[arm], lw=1.2, alpha=0.6)
     axes.set_ylim(-3, 103)
-    axes.set_ylabel(f"{found.metric.label.lower()}, %")
+    axes.set_ylabel(f"{_name_score(found)}, %")
     _legend(axes)
     return _svg(figure, "anytime-curve")
 
 
 def anytime_differences(found: Breakdown) -> Markup:
-    """Plot the gain in score over a base if episodes are cut after a number of primitives, with bands."""
+    """Plot the gain in score over a base if episodes are cut after so many primitives or decisions, with bands."""
     figure, axes = _figure()
     _draw_bands(axes, found, arm_colors([found.base, *found.estimates]))
     axes.axhline(0, color=INK, lw=1, alpha=0.5)
-    axes.set_ylabel(f"{found.metric.label.lower()}, points")
+    axes.set_ylabel(f"{_name_score(found)}, points")
     _legend(axes)
     return _svg(figure, f"anytime-differences-{found.base}")
 
 
+def _name_score(found: Breakdown) -> str:
+    return "success rate" if found.metric.name == SUCCESS.name else found.metric.label.lower()
+
+
 def _draw_bands(axes: Axes, found: Breakdown, colors: Mapping[str, str]) -> None:
-    """Draw each arm's estimates over primitives as a line with a band."""
+    """Draw each arm's estimates over the cuts as a line with a band."""
     cuts = [int(key) for key in found.keys]
     for arm, estimates in found.estimates.items():
         if arm == BLIND:
@@ -461,7 +448,7 @@ def _draw_bands(axes: Axes, found: Breakdown, colors: Mapping[str, str]) -> None
         axes.plot(x, values, "-o", color=colors[arm], lw=2, ms=5, label=arm)
     axes.set_xlim(0, cuts[-1] * 1.03)
     axes.set_xticks([0, *cuts])
-    axes.set_xlabel("primitives")
+    axes.set_xlabel(found.cut_unit)
 
 
 def _readable_on(color: str) -> str:

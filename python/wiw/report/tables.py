@@ -179,7 +179,7 @@ def _list_tables(summary: Summary, width: int) -> list[Any]:
     parts += _arm_tables(summary, width)
     if summary.utilities:
         parts.append(_utilities(summary))
-    for breakdown in summary.breakdowns:
+    for breakdown in filter(lambda found: found.stands_in_terminal, summary.breakdowns):
         parts += _breakdown_tables(breakdown, "\n" if len(breakdown.columns) > NARROW else " ", width)
     for group in summary.groups():
         parts += _difference_tables(summary, group, gap, width)

@@ -135,12 +135,18 @@ class AR(NavigationTask):
             ar.measure_clarity(state.world, fork.position, int(state.episode.info["target"])) - 0.001 * primitives_left
         )
 
-    def final_answer(self, state: EpisodeState) -> Answer | None:
-        """Return the answer that counts, of those given so far."""
-        given = [answer for answer in state.answers if isinstance(answer, Answer)]
+    def final_answer(self, state: EpisodeState, decisions: int | None = None) -> Answer | None:
+        """Return the answer that counts, of those given so far, or at the first `decisions`."""
+        given = [answer for answer in state.answers[:decisions] if isinstance(answer, Answer)]
         if not given:
             return None
         return max(given, key=lambda answer: answer.confidence) if self.rules.prediction == "surest" else given[-1]
+
+    def describe_end(self, state: EpisodeState) -> dict[str, Any]:
+        """Return `right_after`: after each decision, whether the answer that would have counted then is right."""
+        finals = [self.final_answer(state, count + 1) for count in range(len(state.answers))]
+        right = state.episode.info["category"]
+        return {"right_after": [answer is not None and answer.label == right for answer in finals]}
 
     def measure(self, state: EpisodeState) -> dict[str, float]:
         """Return the metrics of one finished episode.

@@ -61,7 +61,8 @@ class NavigationTask(NavigationSpec, Task):
         self.rules: Any = presets.load_rules(self.rules_class, owner, preset, self.overridden)
         self.preset = presets.make_absolute(preset)
         self.preset_settings = presets.load_preset(owner, preset)
-        self._generator_rules = {name: value for name, value in rules.items() if name not in own}
+        given = {name: value for name, value in rules.items() if name not in own}
+        self._generator_rules = {**self.preset_settings.generator, **given}
         self.generator: Any = presets.load_rules(self.generator_class, "", presets.DEFAULT, self._generator_rules)
         self.scenes, self.seed = absolute(scenes), check_seed(seed)
         self.backend, self.per_scene = backend, per_scene

@@ -5,6 +5,8 @@ user's.
 base: official        # a shipped preset that holds where this file says nothing; `default` if left out
 about: our long run   # one line for `wiw list`
 decisions: 40         # rules of the task
+generator:            # rules that generated episodes satisfy
+  farthest: 4.0
 policies:             # options of policies by name, where the command line gives no others
   vlm: {history: 0}
 models:               # options of world models, likewise; or a YAML file beside this one
@@ -26,7 +28,7 @@ from wiw.suggestions import did_you_mean
 
 FOLDER = Path(__file__).parents[1] / "configs"
 DEFAULT, PAPER = "default", "paper"
-HEADER = ("base", "about", "policies", "models", "departures")
+HEADER = ("base", "about", "generator", "policies", "models", "departures")
 """Keys that are no rules."""
 CONCERNS = ("rules", "vlm", "models", "text models")
 """Whom a departure concerns: every run, runs with policy `vlm`, with a world model, with one that is told words."""
@@ -43,6 +45,8 @@ class Preset:
     """All that a preset sets, those that it is based on included."""
 
     rules: Mapping[str, Any] = field(default_factory=dict)
+    generator: Mapping[str, Any] = field(default_factory=dict)
+    """Rules of generated episodes, checked by the task that generates them."""
     policies: Options = field(default_factory=dict)
     models: Options = field(default_factory=dict)
     departures: Mapping[str, Mapping[str, str]] = field(default_factory=dict)
@@ -57,17 +61,19 @@ def load_preset(task: str, preset: str | Path) -> Preset:
         FileError: a file cannot be read, or does not hold a mapping.
     """
     rules: dict[str, Any] = {}
+    generator: dict[str, Any] = {}
     policies: dict[str, dict[str, Any]] = {}
     models: dict[str, dict[str, Any]] = {}
     reasons: dict[str, dict[str, Any]] = {}
     for path in _chain(task, preset):
         content = _read(path)
         rules |= _without_header(content)
+        generator |= _read_generator_rules(content, path)
         _add_options(policies, _read_options(content, "policies", path))
         _add_options(models, _read_options(content, "models", path))
         _add_options(reasons, _read_departures(content, path))
     given = {who: {topic: str(why) for topic, why in own.items() if why} for who, own in reasons.items()}
-    return Preset(rules, policies, models, given)
+    return Preset(rules, generator, policies, models, given)
 
 
 def list_presets(task: str) -> list[str]:
@@ -185,6 +191,13 @@ def _read(path: Path) -> Mapping[str, Any]:
 
 def _without_header(content: Mapping[str, Any]) -> dict[str, Any]:
     return {name: value for name, value in content.items() if name not in HEADER}
+
+
+def _read_generator_rules(content: Mapping[str, Any], path: Path) -> Mapping[str, Any]:
+    rules = content.get("generator", {})
+    if not isinstance(rules, Mapping):
+        raise ArgumentError(f"{path}: generator: expected rules of generated episodes, `name: value`, got {rules!r}")
+    return {str(name): value for name, value in rules.items()}
 
 
 def _read_options(content: Mapping[str, Any], section: str, path: Path) -> Options:

@@ -25,7 +25,16 @@ from wiw.files import atomic_file
 from wiw.perception.glimpses import Glimpses
 from wiw.perception.scene_labels import CATEGORIES
 from wiw.scenes.store import build_digest
-from wiw.training.glimpse_sets import GlimpseSetRules, GlimpseSets, collect_glimpse_sets, merge_glimpse_sets
+from wiw.training.glimpse_sets import (
+    HARD_LOOKS,
+    WAY_SHARES,
+    GlimpseSetRules,
+    GlimpseSets,
+    collect_glimpse_sets,
+    collect_hard_sets,
+    join_glimpse_sets,
+    merge_glimpse_sets,
+)
 from wiw.training.labelled_views import FIELDS as VIEW_FIELDS
 from wiw.training.labelled_views import LabelledViews, ViewRules, change_states, merge_views, record_views
 from wiw.training.walks import WalkRules, Walks, record_walks
@@ -72,10 +81,30 @@ def gather_glimpse_sets(
         ArgumentError: the scenes show nothing of `categories`.
     """
     make = partial(_build_glimpse_sets, seed=seed, categories=tuple(categories), rules=rules)
-    job = Job(f"glimpses in {specs}", GLIMPSE_SET_FIELDS, make, (1, list(categories), seed, asdict(rules)))
+    job = Job(f"glimpses in {specs}", GLIMPSE_SET_FIELDS, make, (2, list(categories), seed, asdict(rules)))
+    return merge_glimpse_sets(_gather_sets(specs, job, folder, workers, bar))
+
+
+def gather_hard_sets(
+    specs: str, categories: Sequence[str], seed: int, folder: Path, workers: int, bar: ProgressBar
+) -> GlimpseSets:
+    """Load the glimpse sets of all scenes of a spec whose first look is hard; build those that `folder` lacks.
+
+    There are none where the scenes show nothing that is hard to see at first and clear from nearby.
+
+    Raises:
+        FileError: the folder cannot be written.
+    """
+    make = partial(_build_hard_sets, seed=seed, categories=tuple(categories))
+    identity = ("hard", 1, list(categories), seed, asdict(HARD_LOOKS), list(WAY_SHARES))
+    job = Job(f"hard looks in {specs}", GLIMPSE_SET_FIELDS, make, identity)
+    return join_glimpse_sets(_gather_sets(specs, job, folder, workers, bar))
+
+
+def _gather_sets(specs: str, job: Job, folder: Path, workers: int, bar: ProgressBar) -> list[GlimpseSets]:
     found = gather_arrays(_resolve_scenes(specs), job, folder, workers, bar)
     parts = [(Glimpses(a["images"], a["boxes"], a["scalars"]), a["owners"], a["kinds"], a["labels"]) for a in found]
-    return merge_glimpse_sets([GlimpseSets(*part) for part in parts])
+    return [GlimpseSets(*part) for part in parts]
 
 
 def gather_walks(specs: str, seed: int, rules: WalkRules, folder: Path, workers: int, bar: ProgressBar) -> Walks:
@@ -126,7 +155,14 @@ def _resolve_scenes(specs: str) -> dict[str, str]:
 
 
 def _build_glimpse_sets(name: str, seed: int, categories: Sequence[str], rules: GlimpseSetRules) -> Arrays:
-    sets = collect_glimpse_sets(world(name), seed, categories, rules)
+    return _list_arrays(collect_glimpse_sets(world(name), seed, categories, rules))
+
+
+def _build_hard_sets(name: str, seed: int, categories: Sequence[str]) -> Arrays:
+    return _list_arrays(collect_hard_sets(world(name), seed, categories))
+
+
+def _list_arrays(sets: GlimpseSets) -> Arrays:
     glimpses = sets.glimpses
     values = (glimpses.images, glimpses.boxes, glimpses.scalars, sets.owners, sets.kinds, sets.labels)
     return dict(zip(GLIMPSE_SET_FIELDS, values, strict=True))

@@ -4,14 +4,15 @@
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Sequence
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
 
 from wiw._core import core
-from wiw.datasets.ar import CATEGORIES, category_of
+from wiw.datasets.ar import CATEGORIES, EpisodeRules, category_of, generate
 from wiw.datasets.cameras import camera_pose
 from wiw.datasets.visibility import COARSE, measure_sizes
 from wiw.datasets.worlds import World
@@ -19,27 +20,39 @@ from wiw.errors import ArgumentError
 from wiw.perception.glimpses import Glimpses, extract_glimpses, join_glimpses
 from wiw.perception.tracking import remove_specks, reproject_masks
 from wiw.reproject import warp
+from wiw.types import Episode
 
 START, NEAR, PERFECT, WARPED = 0, 1, 2, 3
 """Kinds of glimpses: from the place itself; really seen from a place nearby; imagined from there by a perfect world
 model; imagined by reprojection. The box of an imagined glimpse is the tracker's.
 """
+HARD_LOOKS = EpisodeRules(first_look="balanced", small=0.4)
+"""Rules of the first looks of hard sets."""
+WAY_SHARES = np.array([0.0, 0.4, 0.7, 1.0])
+"""Shares of the way to the best view at which a hard set is looked at."""
 
 
 @dataclass(frozen=True)
 class GlimpseSetRules:
     """How a scene is sampled. Lengths in metres."""
 
-    places: int = 16
+    places: int = 8
     targets: int = 5
     """Most objects observed from a place; those of rare categories come first."""
     neighbours: int = 3
-    reach: tuple[float, float] = (0.25, 0.8)
-    """Least and greatest distance of the neighbours; the second is the length of four steps."""
+    reach: tuple[float, float] = (0.25, 1.6)
+    """Least and greatest distance of the neighbours; the second is the length of eight steps."""
     smallest: float = 0.0015
     """Least solid angle of a target in steradians, 45 pixels of the panorama."""
     survey: int = 150
     """Number of candidate places."""
+    reshape: float = 1.25
+    """Greatest factor by which furniture is stretched or shrunk along each of its axes, at every other place anew; 1
+    leaves it as it is."""
+
+    def __post_init__(self) -> None:
+        if not (np.isfinite(self.reshape) and self.reshape >= 1):
+            raise ArgumentError(f"GlimpseSetRules: reshape: expected a factor of 1 or more, got {self.reshape}")
 
 
 @dataclass(frozen=True)
@@ -65,10 +78,16 @@ def merge_glimpse_sets(parts: Sequence[GlimpseSets]) -> GlimpseSets:
     Raises:
         ArgumentError: there is not one set in them.
     """
-    counts = [len(part) for part in parts]
-    if not sum(counts):
+    if not sum(len(part) for part in parts):
         raise ArgumentError("expected scenes that show things of the categories, got none; name others (--scenes)")
-    shifts = np.cumsum([0, *counts[:-1]])
+    return join_glimpse_sets(parts)
+
+
+def join_glimpse_sets(parts: Sequence[GlimpseSets]) -> GlimpseSets:
+    """Concatenate sets; an empty list gives none."""
+    nothing = GlimpseSets(join_glimpses([]), *(np.zeros(0, np.int64) for _ in range(3)))
+    parts = [nothing, *parts]
+    shifts = np.cumsum([0, *(len(part) for part in parts[:-1])])
     return GlimpseSets(
         join_glimpses([part.glimpses for part in parts]),
         np.concatenate([part.owners + shift for part, shift in zip(parts, shifts, strict=True)]),
@@ -109,11 +128,52 @@ def collect_glimpse_sets(
         place = _choose_place(sizes, labels, tally, rules)
         if place is None:
             break
-        parts += _collect_at_place(world, points[place], labels, tally, core.fold_key([key, number]), rules)
+        draw = core.fold_key([key, number])
+        with reshape_furniture(world, labels, core.fold_key([draw, 2]), rules.reshape if number % 2 else 1.0):
+            parts += _collect_at_place(world, points[place], labels, tally, draw, rules)
         sizes[place] = 0
-    if not parts:
-        return GlimpseSets(join_glimpses([]), np.zeros(0, np.int64), np.zeros(0, np.int64), np.zeros(0, np.int64))
-    return merge_glimpse_sets(parts)
+    return join_glimpse_sets(parts)
+
+
+@contextmanager
+def reshape_furniture(world: World, labels: NDArray[np.int64], key: int, most: float) -> Iterator[None]:
+    """Render each labelled instance stretched along its own axes, by random factors from 1 / `most` to `most`.
+
+    The middle of its lower side stays where it is, so that what stands on the floor goes on to.
+
+    Args:
+        world: where the furniture stands.
+        labels: int64 [1 + instances]: -1 for instances that are left as they are.
+        key: of the random factors.
+        most: 1 leaves all as it is.
+    """
+    ids = np.flatnonzero(labels >= 0).astype(np.uint32)
+    if most == 1 or not len(ids):
+        yield
+        return
+    things = [world.scene.instances[number - 1] for number in ids]
+    homes = np.array([thing["T_world_instance"] for thing in things], np.float64)
+    factors = most ** (2 * core.uniform(key, 3 * len(ids)).reshape(-1, 3) - 1)
+    bounds = np.array([thing["bounds"] for thing in things], np.float64)
+    pivots = bounds.mean(axis=1)
+    pivots[:, 1] = bounds[:, 0, 1]
+    world.renderer.set_poses(ids, _stretch(homes, factors, pivots))
+    try:
+        yield
+    finally:
+        world.renderer.set_poses(ids, homes)
+
+
+def _stretch(
+    T_world_instance: NDArray[np.float64], factors: NDArray[np.float64], pivots: NDArray[np.float64]
+) -> NDArray[np.float64]:
+    """Return affine poses [N, 4, 4] that scale along the instances' axes and keep the pivots [N, 3] (world metres)."""
+    axes = T_world_instance[:, :3, :3]
+    scaled = T_world_instance.copy()
+    scaled[:, :3, :3] = axes * factors[:, None, :]
+    inside = np.linalg.solve(axes, (pivots - T_world_instance[:, :3, 3])[..., None])
+    scaled[:, :3, 3] = pivots - (scaled[:, :3, :3] @ inside)[..., 0]
+    return scaled
 
 
 def _choose_place(
@@ -137,24 +197,82 @@ def _collect_at_place(
     rules: GlimpseSetRules,
 ) -> list[GlimpseSets]:
     """Build one set for each of the chosen objects."""
-    poses = np.stack([camera_pose(spot, 0.0) for spot in [point, *_sample_neighbours(world, point, key, rules)]])
+    points = np.stack([point, *_sample_neighbours(world, point, key, rules)])
+
+    def choose(ids: NDArray[np.uint32]) -> list[int]:
+        return _choose_targets(ids, labels, tally, rules)
+
+    parts = _build_sets(world, points, choose, labels)
+    for part in parts:
+        tally[int(part.labels[0])] += 1
+    return parts
+
+
+def collect_hard_sets(
+    world: World,
+    seed: int,
+    categories: Sequence[str] = CATEGORIES,
+    count: int = 5,
+    rules: EpisodeRules = HARD_LOOKS,
+) -> GlimpseSets:
+    """Collect glimpses whose first look is hard, the others from the way to the best view, as episodes have them.
+
+    Args:
+        world: where the objects are.
+        seed: of the episodes, which are generated for this purpose.
+        categories: what objects are.
+        count: sets; fewer in a scene that does not offer as many.
+        rules: of first and best looks.
+    """
+    numbers = {name: i for i, name in enumerate(categories)}
+    labels = np.array([-1, *(numbers.get(category_of(thing), -1) for thing in world.scene.instances)])
+    parts: list[GlimpseSets] = []
+    for episode in _generate_episodes(world, count, seed, categories, rules):
+        start, end = np.asarray(episode.start_position), np.asarray(episode.info["best_position"])
+        points = world.ground.put_down(start + WAY_SHARES[:, None] * (end - start)).astype(np.float64)
+        target = int(episode.info["target"])
+        parts += _build_sets(world, points, lambda ids, target=target: [target], labels)  # type: ignore[misc]
+    return join_glimpse_sets(parts)
+
+
+def _generate_episodes(
+    world: World, count: int, seed: int, categories: Sequence[str], rules: EpisodeRules
+) -> list[Episode]:
+    """Return as many episodes as a scene offers, at most `count`."""
+    for fewer in range(count, 0, -1):
+        try:
+            return generate(world, fewer, seed, categories, rules)
+        except ArgumentError:
+            continue
+    return []
+
+
+def _build_sets(
+    world: World,
+    points: NDArray[np.float64],
+    choose: Callable[[NDArray[np.uint32]], list[int]],
+    labels: NDArray[np.int64],
+) -> list[GlimpseSets]:
+    """Build a set for each object that `choose` picks among the ids seen from the first point, uint32 [H, W]."""
+    poses = np.stack([camera_pose(spot, 0.0) for spot in points])
     shown = world.renderer.panorama(poses)
     color, depth, ids = shown["color"], shown["depth"][0], shown["instance"]
+    things = choose(ids[0])
+    if not things:
+        return []
     relative = np.linalg.inv(poses[0]) @ poses[1:]
     imagined = warp(color[:1], depth[None], relative[None])[0] if len(relative) else color[1:]
     panoramas = np.concatenate([color, color[1:], imagined])
     kinds = np.repeat([START, NEAR, PERFECT, WARPED], [1, *[len(relative)] * 3])
-    things = _choose_targets(ids[0], labels, tally, rules)
-    if not things:
-        return []
     here = np.array([ids[0] == thing for thing in things])
     moved = reproject_masks(here, depth, relative, depth.shape)[0] if len(relative) else here[:, None][:, :0]
     sets = []
     for thing, masks in zip(things, moved, strict=True):
         tracked = remove_specks(masks)
         found, frames = extract_glimpses(panoramas, np.concatenate([ids == thing, tracked, tracked]), kinds <= NEAR)
+        if not len(frames) or frames[0]:  # nothing of it is in the panorama, which has coarser pixels than the survey
+            continue
         sets.append(GlimpseSets(found, np.zeros(len(frames), np.int64), kinds[frames], labels[[thing]]))
-        tally[int(labels[thing])] += 1
     return sets
 
 

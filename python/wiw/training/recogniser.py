@@ -20,12 +20,12 @@ from wiw.perception.recognition_network import Network, to_network_input
 from wiw.training.glimpse_sets import NEAR, PERFECT, START, WARPED, GlimpseSets
 from wiw.training.trainer import run_training, warmup_cosine_schedule
 
-COLOUR_CHANNELS = [0, 1, 2, 4, 5, 6]
-"""Channels of the network's input that are not boxes."""
 REAL_COLUMN = 4
 """Column of `Glimpses.scalars` that marks real glimpses."""
 MAX_EXTRA_GLIMPSES = 4
 """Most glimpses of a set that training adds to the first."""
+CONFUSION_RATE = 0.05
+"""Share by which a batch changes the running confusion of categories."""
 
 
 @dataclass(frozen=True)
@@ -40,8 +40,16 @@ class Recipe:
     rate: float = 3e-3
     decay: float = 0.02
     smoothing: float = 0.05
+    hard: int = 4
+    """How often sets whose first look is hard count."""
     alone: float = 0.5
     """Weight of the loss of single glimpses beside that of sets."""
+    recolor: float = 0.5
+    """Share of sets whose colours change places, and of those whose target, or all of them, is grey or tinted."""
+    transplant: float = 0.2
+    """Share of glimpses whose surroundings are those of another one."""
+    degrade: float = 0.25
+    """Share of glimpses that are blurred, of those with noise, and of those with a part covered."""
     seed: int = 0
 
     def __post_init__(self) -> None:
@@ -55,6 +63,7 @@ def train(
     recipe: Recipe = Recipe(),
     minutes: float | None = None,
     on_step: Callable[[int, int, float], None] = lambda step, steps, loss: None,
+    start: Network | None = None,
 ) -> tuple[Network, Recipe]:
     """Train a network; return it with the recipe that reproduces it without a time limit.
 
@@ -64,10 +73,19 @@ def train(
         recipe: how to train; see `Recipe`.
         minutes: if given, reduces the number of epochs so that training takes about this long.
         on_step: called after each step with its number, the number of all steps and a running mean of the loss.
+        start: network of the same categories and width whose training goes on; None for a new one.
+
+    Raises:
+        ArgumentError: `start` has other categories or another width.
     """
+    if start is not None and (start.categories, start.width) != (len(categories), recipe.width):
+        raise ArgumentError(
+            f"recogniser: expected a start of {len(categories)} categories and width {recipe.width}, got "
+            f"{start.categories} and {start.width}"
+        )
     steps_per_epoch = max(1, len(data) // recipe.batch)
     trainer, recipe = run_training(
-        lambda: _Trainer(data, categories, recipe),
+        lambda: _Trainer(data, categories, recipe, start),
         recipe,
         steps_per_epoch,
         minutes,
@@ -80,24 +98,45 @@ def train(
 class _Trainer:
     """The network in training, with everything that its next step depends on."""
 
-    def __init__(self, data: GlimpseSets, categories: Sequence[str], recipe: Recipe) -> None:
+    def __init__(
+        self, data: GlimpseSets, categories: Sequence[str], recipe: Recipe, start: Network | None = None
+    ) -> None:
         torch.manual_seed(core.fold_key([recipe.seed, 0x4C01]) % 2**63)
         self.data, self.recipe = data, recipe
         self.network = Network(len(categories), recipe.width).to(memory_format=torch.channels_last)  # type: ignore[call-overload]
+        if start is not None:
+            self.network.load_state_dict(start.state_dict())
         self._rng = np.random.default_rng(core.fold_key([recipe.seed, 0x4C02]))
         self._optimiser = torch.optim.AdamW(self.network.parameters(), recipe.rate, weight_decay=recipe.decay)
         self._sampling_weights = _compute_sampling_weights(data.labels)
+        self._confusion = np.full((len(categories), len(categories)), 1 / len(categories))
 
     def train_step(self, learning_rate: float) -> float:
         """Train on one batch of glimpse sets and return its loss."""
         for group in self._optimiser.param_groups:
             group["lr"] = learning_rate
-        sets = self._rng.choice(len(self.data), self.recipe.batch, p=self._sampling_weights)
-        loss = _compute_loss(self.network, self.data, sets, self.recipe, self._rng)
+        sets = self._draw_sets()
+        loss, shares = _compute_loss(self.network, self.data, sets, self.recipe, self._rng)
+        for label, row in zip(self.data.labels[sets], shares, strict=True):
+            self._confusion[label] += CONFUSION_RATE * (row - self._confusion[label])
         self._optimiser.zero_grad(set_to_none=True)
         loss.backward()
         self._optimiser.step()
         return float(loss.detach())
+
+    def _draw_sets(self) -> NDArray[np.int64]:
+        """Draw a batch of hard pairs: a set, and one of a category that its own is at present confused with."""
+        half = (self.recipe.batch + 1) // 2
+        first = self._rng.choice(len(self.data), half, p=self._sampling_weights)
+        paired = [self._draw_confused(int(label)) for label in self.data.labels[first]]
+        return np.concatenate([first, paired])[: self.recipe.batch]
+
+    def _draw_confused(self, label: int) -> int:
+        weights = self._confusion[label][self.data.labels] * self._sampling_weights
+        weights[self.data.labels == label] = 0
+        if not weights.any():  # there is one category alone
+            weights = self._sampling_weights
+        return int(self._rng.choice(len(self.data), p=weights / weights.sum()))
 
 
 def _compute_sampling_weights(labels: NDArray[np.int64]) -> NDArray[np.float64]:
@@ -108,15 +147,18 @@ def _compute_sampling_weights(labels: NDArray[np.int64]) -> NDArray[np.float64]:
 
 def _compute_loss(
     network: Network, data: GlimpseSets, sets: NDArray[np.int64], recipe: Recipe, rng: np.random.Generator
-) -> Tensor:
+) -> tuple[Tensor, NDArray[np.float64]]:
+    """Return the loss of a batch and the probabilities that its sets get, float64 [sets, categories]."""
     rows, owners = _sample_rows(data, sets, rng)
-    shown, scalars = _augment(data, rows, owners, rng)
+    shown, scalars = _augment(data, rows, owners, recipe, rng)
     logits, weights = network.train().encode_glimpses(shown, scalars)
     places = torch.from_numpy(owners)
     targets = torch.from_numpy(data.labels[sets])
     entropy = torch.nn.functional.cross_entropy
-    together = entropy(network.fuse(logits, weights, places, len(sets)), targets, label_smoothing=recipe.smoothing)
-    return together + recipe.alone * entropy(logits, targets[places], label_smoothing=recipe.smoothing)
+    fused = network.fuse(logits, weights, places, len(sets))
+    together = entropy(fused, targets, label_smoothing=recipe.smoothing)
+    loss = together + recipe.alone * entropy(logits, targets[places], label_smoothing=recipe.smoothing)
+    return loss, fused.detach().softmax(dim=1).double().numpy()
 
 
 def _sample_rows(
@@ -142,21 +184,83 @@ def _augment(
     data: GlimpseSets,
     rows: NDArray[np.int64],
     owners: NDArray[np.int64],
+    recipe: Recipe,
     rng: np.random.Generator,
 ) -> tuple[Tensor, Tensor]:
-    """Return pictures and scalars with other brightness and tint, boxes slightly off, and half of them mirrored."""
+    """Return pictures and scalars as of other furniture, light and cameras, boxes slightly off, and half mirrored.
+
+    All glimpses of a set are recoloured alike, as they show one object; what degrades a picture is each one's own.
+    """
     found = data.glimpses[rows]
     extent = found.boxes[..., 2:] - found.boxes[..., :2]
     off = rng.uniform(-0.04, 0.04, (len(rows), 1, 4)) * np.concatenate([extent, extent], axis=-1)
     scalars = found.scalars * rng.uniform(0.96, 1.04, found.scalars.shape)
     scalars[:, REAL_COLUMN] = found.scalars[:, REAL_COLUMN]
     shown = to_network_input(torch.from_numpy(found.images), torch.from_numpy((found.boxes + off).astype(np.float32)))
-    light = rng.uniform(0.8, 1.2, (owners.max() + 1, 1)) * rng.uniform(0.92, 1.08, (owners.max() + 1, 3))
-    gain = torch.from_numpy(np.tile(light[owners], 2).astype(np.float32))[:, :, None, None]
-    shown[:, COLOUR_CHANNELS] = (shown[:, COLOUR_CHANNELS] + 1) * gain - 1
+    colours, boxes = _split_channels(shown)
+    colours = _recolor(colours, boxes, owners, recipe.recolor, rng)
+    colours = _degrade(_transplant(colours, boxes, recipe.transplant, rng), recipe.degrade, rng)
+    shown = torch.cat([colours, boxes[:, :, None]], dim=2).flatten(1, 2)
     mirrored = torch.from_numpy(rng.random(len(rows)) < 0.5)
     shown = torch.where(mirrored[:, None, None, None], shown.flip(3), shown)
     return shown.contiguous(memory_format=torch.channels_last), torch.from_numpy(scalars.astype(np.float32))
+
+
+def _split_channels(shown: Tensor) -> tuple[Tensor, Tensor]:
+    """Return colours [N, 2, 3, H, W], 0 to 1, and boxes [N, 2, H, W] of a network's input."""
+    views = shown.unflatten(1, (2, 4))
+    return (views[:, :, :3] + 1) / 2, views[:, :, 3]
+
+
+def _recolor(
+    colours: Tensor, boxes: Tensor, owners: NDArray[np.int64], share: float, rng: np.random.Generator
+) -> Tensor:
+    """Return colours 0 to 1 in another light, in part with other hues, inside the box otherwise than around it."""
+    count = int(owners.max()) + 1
+    around, inside = (_draw_color_matrices(count, share, rng)[owners] for _ in range(2))
+    own = torch.from_numpy(rng.random(count) < share)[owners][:, None, None, None, None]
+    everywhere = torch.einsum("nij,nvjhw->nvihw", around, colours)
+    boxed = torch.where(own, torch.einsum("nij,nvjhw->nvihw", inside, colours), everywhere)
+    mixed = torch.where((boxes > 0)[:, :, None], boxed, everywhere).clamp(0, 1)
+    gamma = torch.from_numpy(rng.uniform(0.75, 1.35, count).astype(np.float32))[owners]
+    return mixed.clamp_min(1e-3) ** gamma[:, None, None, None, None]
+
+
+def _transplant(colours: Tensor, boxes: Tensor, share: float, rng: np.random.Generator) -> Tensor:
+    """Return colours in which some boxes are surrounded by what surrounds those of other glimpses."""
+    moved = torch.from_numpy(rng.random(len(colours)) < share)
+    others = torch.from_numpy(rng.permutation(len(colours)))
+    return torch.where(moved[:, None, None, None, None] & (boxes <= 0)[:, :, None], colours[others], colours)
+
+
+def _draw_color_matrices(count: int, share: float, rng: np.random.Generator) -> Tensor:
+    """Return [count, 3, 3]: brightness and tint, and for a share of them channels that change places or turn grey."""
+    matrices = np.repeat(np.eye(3)[None], count, axis=0)
+    for i in np.flatnonzero(rng.random(count) < share):
+        matrices[i] = np.eye(3)[rng.permutation(3)]
+        grey = rng.choice([0.0, rng.random(), 1.0])
+        matrices[i] = (1 - grey) * matrices[i] + grey / 3
+    light = rng.uniform(0.75, 1.25, (count, 1)) * rng.uniform(0.85, 1.15, (count, 3))
+    return torch.from_numpy((light[:, :, None] * matrices).astype(np.float32))
+
+
+def _degrade(colours: Tensor, share: float, rng: np.random.Generator) -> Tensor:
+    """Return colours as network input, -1 to 1, some blurred, some noisy, some with a rectangle of one colour."""
+    count, _, _, rows, columns = colours.shape
+    blurred, noisy, covered = (np.flatnonzero(rng.random(count) < share) for _ in range(3))
+    colours = colours.clone()
+    if len(blurred):
+        flat = colours[blurred].flatten(1, 2)
+        colours[blurred] = torch.nn.functional.avg_pool2d(flat, 3, 1, 1, count_include_pad=False).unflatten(1, (2, 3))
+    if len(noisy):
+        shape = tuple(colours[noisy].shape)
+        colours[noisy] += torch.from_numpy(rng.normal(0, 0.04, shape).astype(np.float32))
+    for i in covered:
+        height, width = rng.integers(rows // 8, rows // 2, 2)
+        top, left = rng.integers(0, rows - height), rng.integers(0, columns - width)
+        patch = torch.from_numpy(rng.random((3, 1, 1)).astype(np.float32))
+        colours[i, int(rng.integers(2)), :, top : top + height, left : left + width] = patch
+    return 2 * colours - 1
 
 
 # -- measuring ---------------------------------------------------------------------------------------------------------
@@ -192,23 +296,29 @@ GLIMPSE_MIXES = {"start": (START, 0)} | {
 
 
 def calibrate(
-    network: Network, categories: Sequence[str], calibration: GlimpseSets, held_out: GlimpseSets, card: dict[str, Any]
+    network: Network,
+    categories: Sequence[str],
+    calibration: GlimpseSets,
+    held_out: GlimpseSets,
+    card: dict[str, Any],
+    hard: GlimpseSets | None = None,
 ) -> Recogniser:
-    """Fit the temperature on `calibration`, and measure accuracy and calibration error on `held_out`."""
+    """Fit the temperature on `calibration`, and measure accuracy and calibration error on `held_out`.
+
+    Accuracy is also measured on `hard`, sets of held-out scenes whose first look is hard, if there are any.
+    """
     recogniser = Recogniser(network, categories)
     fitting = np.concatenate(
         [compute_set_logits(network, calibration, select_rows(calibration, *view)) for view in GLIMPSE_MIXES.values()]
     )
     recogniser.temperature = fit_temperature(fitting, np.tile(calibration.labels, len(GLIMPSE_MIXES)))
-    logits = {
-        name: compute_set_logits(network, held_out, select_rows(held_out, *view))
-        for name, view in GLIMPSE_MIXES.items()
-    }
+    logits = _compute_mixed_logits(network, held_out)
     pooled, labels = np.concatenate(list(logits.values())), np.tile(held_out.labels, len(logits))
     recogniser.card = {
         **card,
         "held_out_sets": len(held_out),
         "accuracy": {name: _compute_accuracy(values, held_out.labels) for name, values in logits.items()},
+        "accuracy_hard": measure_accuracy(network, hard) if hard else {},
         "calibration_error": {
             "before": round(calibration_error(softmax(pooled), labels), 4),
             "after": round(calibration_error(softmax(pooled, recogniser.temperature), labels), 4),
@@ -220,6 +330,17 @@ def calibrate(
         },
     }
     return recogniser
+
+
+def measure_accuracy(network: Network, data: GlimpseSets) -> dict[str, float]:
+    """Return the share of sets that are recognised, with each of `GLIMPSE_MIXES`."""
+    return {
+        name: _compute_accuracy(values, data.labels) for name, values in _compute_mixed_logits(network, data).items()
+    }
+
+
+def _compute_mixed_logits(network: Network, data: GlimpseSets) -> dict[str, NDArray[np.float64]]:
+    return {name: compute_set_logits(network, data, select_rows(data, *mix)) for name, mix in GLIMPSE_MIXES.items()}
 
 
 def _compute_accuracy(logits: NDArray[np.float64], labels: NDArray[np.int64]) -> float:
