@@ -115,11 +115,11 @@ def study_errors(
     $ wiw study errors --workers 16 --lpips auto               # all tasks, errors and doses: hours
     $ wiw study errors --tasks ar --read-only                  # tables and page of what has been run so far
 
-    Looks (blur, noise, tint, resolution), flicker, control (scale, direction, lag, drift, ignored) and content
-    (missing, moved, invented, open); `wiw list errors` says what each does and the unit of its doses. All arms, none
-    and oracle among them, run on the same episodes, and every number is paired with the oracle: success, regret of the
-    choices, and how far frames and cameras were from the true ones. An error that makes no sense in a task is left out
-    and named.
+    There are errors of looks (blur, noise, tint, resolution), flicker, control (scale, direction, lag, drift, ignored)
+    and content (missing, moved, invented, open); `wiw list errors` says what each does and the unit of its doses. All
+    arms, none and oracle among them, run on the same episodes, and every number is paired with the oracle: success,
+    regret of the choices, and how far frames and cameras were from the true ones. An error that makes no sense in a
+    task is left out and named.
 
     Writes errors.html, .svg, .png and .json into the folder, beside ordinary runs that hold a few episodes each, of all
     arms. After Ctrl-C the same command goes on. Any run takes single errors as arms: `wiw run imagenav --arms
