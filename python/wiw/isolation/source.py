@@ -4,6 +4,7 @@
 from __future__ import annotations
 
 import inspect
+import weakref
 from collections.abc import Callable, Mapping, Sequence
 from functools import partial
 from pathlib import Path
@@ -13,6 +14,14 @@ from wiw.errors import InfrastructureError, RegistryError
 from wiw.isolation.child import Host
 from wiw.isolation.failures import EndedError, ExitError
 from wiw.isolation.process import ChildProcess
+
+_SOURCES: weakref.WeakSet[Source] = weakref.WeakSet()
+
+
+def end_idle_processes() -> None:
+    """End the processes that have only told what their code says of itself, where other processes will run it."""
+    for source in list(_SOURCES):
+        source.end_idle()
 
 
 class Source:
@@ -29,6 +38,12 @@ class Source:
         self._idle: ChildProcess | None = None
         self.told = self.load(process := ChildProcess())
         self._idle = process
+        _SOURCES.add(self)
+
+    def end_idle(self) -> None:
+        """End the process in which nothing has been made; another one begins when it is asked again."""
+        if self._idle is not None:
+            self._idle.kill()
 
     def ask(self, function: Callable[..., Any], *arguments: Any) -> Any:
         """Call a function on the imported class; see `ChildProcess.call`."""

@@ -8,6 +8,7 @@ from collections.abc import Iterable, Iterator, Mapping, Sequence
 from typing import Any, Protocol
 
 from wiw.errors import Error, InfrastructureError, StoreError
+from wiw.isolation.source import end_idle_processes
 from wiw.runs.config import EngineConfig
 from wiw.runs.films import film_episodes
 from wiw.runs.pictures import drop_spare_pictures
@@ -193,6 +194,8 @@ def _run_jobs(
         for group in (_group_by_scene(left, episodes) if by_scene else [left])
         for first in range(0, len(group), max(1, sizes[arm]))
     ]
+    if jobs and (place.engine == "ray" or workers > 1):
+        end_idle_processes()
     if place.engine == "ray" and jobs:
         from wiw.runs.ray_engine import run_on_ray
 
