@@ -220,14 +220,14 @@ std::vector<Eigen::Vector3d> read_points(MeshFile& file, const fs::path& path) {
   std::vector<Eigen::Vector3d> points;
   if (is_gltf(path)) {
     for_each_mesh(*file.read_gltf(), [&](const scene::Mesh& mesh, const Eigen::Affine3f& placement) {
-      for (const Eigen::Vector3f& position : mesh.positions) points.push_back((placement * position).cast<double>());
+      for (const Eigen::Vector3f& position : mesh.positions) points.emplace_back((placement * position).cast<double>());
     });
     return points;
   }
   const aiScene& scene = file.read(aiProcess_JoinIdenticalVertices);
   for (unsigned m = 0; m < scene.mNumMeshes; ++m) {
     const aiMesh& mesh = *scene.mMeshes[m];
-    for (unsigned v = 0; v < mesh.mNumVertices; ++v) points.push_back(to_eigen(mesh.mVertices[v]).cast<double>());
+    for (unsigned v = 0; v < mesh.mNumVertices; ++v) points.emplace_back(to_eigen(mesh.mVertices[v]).cast<double>());
   }
   return points;
 }

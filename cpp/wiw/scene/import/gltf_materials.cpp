@@ -26,8 +26,8 @@ std::array<float, size> numbers_or(const Json& list, float otherwise) {
 }
 
 /// What a material's surface is made of, in either of glTF's two ways to say it.
-struct Surface {
-  explicit Surface(const Json& material)
+struct GltfSurface {
+  explicit GltfSurface(const Json& material)
       : gloss(material["extensions"]["KHR_materials_pbrSpecularGlossiness"]),
         metal(material["pbrMetallicRoughness"]),
         base(numbers_or<4>(gloss.is_null() ? metal["baseColorFactor"] : gloss["diffuseFactor"], 1)),
@@ -51,7 +51,7 @@ struct Surface {
 };
 
 const Json& drawn_texture(const Json& material) {
-  const Surface surface(material);
+  const GltfSurface surface(material);
   const Json& base = surface.base_texture();
   return base.is_null() || surface.is_emissive_only() ? material["emissiveTexture"] : base;
 }
@@ -144,7 +144,7 @@ float alpha_cutoff(const Json& material) {
 }
 
 Material convert_material(const Json& source, GltfTextures& textures, Scene& scene) {
-  const Surface surface(source);
+  const GltfSurface surface(source);
   const Json& texture = drawn_texture(source);
   const bool is_light = surface.is_emissive_only();
   Material material;

@@ -132,9 +132,10 @@ void TextureSource::warn(const std::vector<Found>& found, Scene& scene) const {
       ++undecodable;
       continue;
     }
-    const std::string& name = image.image->name;
-    scene.warnings.push_back((image.image->embedded ? name : "texture '" + name + "'") + " of " + file + " " +
-                             image.problem + "; drawn in a neutral colour");
+    std::string warning = image.image->embedded ? image.image->name : "texture '" + image.image->name + "'";
+    warning += " of " + file + " ";
+    warning += image.problem + "; drawn in a neutral colour";
+    scene.warnings.push_back(std::move(warning));
   }
   if (undecodable == 0) return;
   scene.warnings.push_back(std::to_string(undecodable) + (undecodable == 1 ? " image of " : " images of ") + file +
