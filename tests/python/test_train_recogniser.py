@@ -156,8 +156,25 @@ def test_training_goes_on_from_a_network() -> None:
     again = train(looks, NAMES, replace(recipe, seed=1), start=first)[0]
     assert torch.equal(first.logits.weight, again.logits.weight)
     assert not torch.equal(first.logits.weight, train(looks, NAMES, replace(recipe, seed=1))[0].logits.weight)
+    plain = train(looks, NAMES, replace(recipe, sizes=False))[0]
+    told = train(looks, NAMES, recipe, start=plain)[0]
+    assert torch.equal(told.mix[0].weight[:, :-3], plain.mix[0].weight) and not told.mix[0].weight[:, -3:].any()
+    with pytest.raises(ArgumentError, match="with sizes"):
+        train(looks, NAMES, replace(recipe, sizes=False), start=told)
     with pytest.raises(ArgumentError, match="expected a start of 3 categories and width 8, got 3 and 4"):
         train(looks, NAMES, Recipe(width=8), start=first)
+
+
+def test_sizes_are_those_of_things_on_the_floor() -> None:
+    from wiw.perception.recognition_network import estimate_sizes
+
+    distance, width, height = np.array([1.2, 3.0, 5.0]), np.array([0.5, 2.0, 1.2]), np.array([0.4, 0.9, 2.1])
+    angles = [2 * np.arctan(width / 2 / distance), np.zeros(3), np.arctan((height - 1) / distance)]
+    scalars = np.column_stack([*angles, -np.arctan(1 / distance), np.ones(3)]).astype(np.float32)
+    expected = np.column_stack([np.log(distance), np.log(width), height])
+    np.testing.assert_allclose(estimate_sizes(torch.from_numpy(scalars)).numpy(), expected, rtol=1e-4, atol=1e-4)
+    above = torch.tensor([[0.2, 0.2, 0.3, 0.1, 1.0], [0.0, 0.0, 1.5, -1.57, 0.0]])  # no floor below; right below
+    assert estimate_sizes(above).isfinite().all()
 
 
 def test_batches_are_pairs_of_categories_that_are_confused() -> None:

@@ -12,6 +12,12 @@ from wiw.perception.glimpses import SCALARS, SIDE
 
 CHANNELS = 8
 """Colour and box of the close and of the wide view."""
+CAMERA_HEIGHT = 1.0
+"""Metres above the floor."""
+FARTHEST = 8.0
+"""Metres beyond which a distance is not estimated."""
+SIZES = 3
+"""Columns of `estimate_sizes`."""
 
 
 def to_network_input(images: Tensor, boxes: Tensor) -> Tensor:
@@ -29,6 +35,19 @@ def to_network_input(images: Tensor, boxes: Tensor) -> Tensor:
     return stacked.flatten(1, 2).contiguous(memory_format=torch.channels_last)
 
 
+def estimate_sizes(scalars: Tensor) -> Tensor:
+    """Return sizes of targets in metres, as if their lower edges were on the floor: float [N, 3], from [N, 5].
+
+    Logarithms of distance and width, and the height of the upper edge. What stands on something else, or whose lower
+    edge is hidden, is taken for farther away, likewise in training.
+    """
+    width, _, upper, lower, _ = scalars.unbind(dim=1)
+    distance = (CAMERA_HEIGHT / torch.tan(-lower).clamp_min(CAMERA_HEIGHT / FARTHEST)).clamp_min(0.1)
+    broad = 2 * distance * torch.tan(width.clamp(0.01, 2.5) / 2)
+    top = CAMERA_HEIGHT + distance * torch.tan(upper.clamp(-1.4, 1.4))
+    return torch.stack([distance.log(), broad.log(), top.clamp(-1.0, 4.0)], dim=1)
+
+
 def _build_block(inputs: int, outputs: int, stride: int) -> nn.Sequential:
     return nn.Sequential(
         nn.Conv2d(inputs, outputs, 3, stride, padding=1, bias=False), nn.BatchNorm2d(outputs), nn.ReLU(inplace=True)
@@ -41,11 +60,16 @@ class Network(nn.Module):
     The sum over a set's glimpses v is  sum(w_v logits_v) / (sum w_v)^(1 - a),  with 0 < w_v and 0 < a < 1 learned: a =
     1 takes glimpses for independent evidence, a = 0 only averages them. The truth lies between, for glimpses of one
     object err alike.
+
+    Args:
+        categories: number of logits.
+        width: channels of the first layer.
+        sizes: whether it is told estimates of sizes in metres (`estimate_sizes`).
     """
 
-    def __init__(self, categories: int, width: int = 32) -> None:
+    def __init__(self, categories: int, width: int = 32, sizes: bool = False) -> None:
         super().__init__()
-        self.categories, self.width = categories, width
+        self.categories, self.width, self.sizes = categories, width, sizes
         self.trunk = nn.Sequential(
             _build_block(CHANNELS, width, 2),
             _build_block(width, 2 * width, 2),
@@ -53,7 +77,7 @@ class Network(nn.Module):
             _build_block(3 * width, 3 * width, 1),
             _build_block(3 * width, 4 * width, 2),
         )
-        self.mix = nn.Sequential(nn.Linear(2 * 4 * width + SCALARS, 4 * width), nn.ReLU(inplace=True))
+        self.mix = nn.Sequential(nn.Linear(2 * 4 * width + SCALARS + SIZES * sizes, 4 * width), nn.ReLU(inplace=True))
         self.drop = nn.Dropout(0.2)
         self.logits = nn.Linear(4 * width, categories)
         self.weight = nn.Linear(4 * width, 1)
@@ -61,11 +85,20 @@ class Network(nn.Module):
         nn.init.zeros_(self.weight.weight)
         nn.init.zeros_(self.weight.bias)
 
+    def continue_from(self, start: Network) -> None:
+        """Copy the weights of a network of the same categories and width; sizes it is not told weigh nothing yet."""
+        state = dict(start.state_dict())
+        if self.sizes and not start.sizes:
+            state["mix.0.weight"] = nn.functional.pad(state["mix.0.weight"], (0, SIZES))
+        self.load_state_dict(state)
+
     def encode_glimpses(self, pictures: Tensor, scalars: Tensor) -> tuple[Tensor, Tensor]:
         """Return logits [N, categories] and weights [N] of single glimpses."""
         maps = self.trunk(pictures)
-        pooled = torch.cat([maps.mean(dim=(2, 3)), maps.amax(dim=(2, 3)), scalars], dim=1)
-        mixed = self.drop(self.mix(pooled))
+        pooled = [maps.mean(dim=(2, 3)), maps.amax(dim=(2, 3)), scalars]
+        if self.sizes:
+            pooled.append(estimate_sizes(scalars))
+        mixed = self.drop(self.mix(torch.cat(pooled, dim=1)))
         return self.logits(mixed), nn.functional.softplus(self.weight(mixed)[:, 0]) + 1e-3
 
     def fuse(self, logits: Tensor, weights: Tensor, owners: Tensor, sets: int) -> Tensor:

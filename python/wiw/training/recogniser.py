@@ -37,6 +37,8 @@ class Recipe:
     """Glimpse sets in a batch."""
     width: int = 32
     """Channels of the first layer."""
+    sizes: bool = True
+    """Whether the network is told estimates of sizes in metres."""
     rate: float = 3e-3
     decay: float = 0.02
     smoothing: float = 0.05
@@ -83,6 +85,8 @@ def train(
             f"recogniser: expected a start of {len(categories)} categories and width {recipe.width}, got "
             f"{start.categories} and {start.width}"
         )
+    if start is not None and start.sizes and not recipe.sizes:
+        raise ArgumentError("recogniser: expected a recipe with sizes, as the start is told them, got one without")
     steps_per_epoch = max(1, len(data) // recipe.batch)
     trainer, recipe = run_training(
         lambda: _Trainer(data, categories, recipe, start),
@@ -103,9 +107,10 @@ class _Trainer:
     ) -> None:
         torch.manual_seed(core.fold_key([recipe.seed, 0x4C01]) % 2**63)
         self.data, self.recipe = data, recipe
-        self.network = Network(len(categories), recipe.width).to(memory_format=torch.channels_last)  # type: ignore[call-overload]
+        network = Network(len(categories), recipe.width, recipe.sizes)
+        self.network = network.to(memory_format=torch.channels_last)  # type: ignore[call-overload]
         if start is not None:
-            self.network.load_state_dict(start.state_dict())
+            self.network.continue_from(start)
         self._rng = np.random.default_rng(core.fold_key([recipe.seed, 0x4C02]))
         self._optimiser = torch.optim.AdamW(self.network.parameters(), recipe.rate, weight_decay=recipe.decay)
         self._sampling_weights = _compute_sampling_weights(data.labels)
