@@ -35,6 +35,7 @@ from wiw.policies.navigator.belief import (  # noqa: E402
 )
 from wiw.policies.navigator.candidates import (  # noqa: E402
     choose_apart,
+    crop_floor,
     list_candidates,
     make_candidate,
     measure_arrivals,
@@ -219,6 +220,18 @@ def test_plans_go_round_corners_and_fill_the_horizon() -> None:
     assert route.poses[:, 1].min() < -1.9
     short = list_candidates(grid, way_map, ways, np.zeros(3), [target], 5)
     assert {len(plan.actions) for plan in short} == {5}
+
+
+@pytest.mark.parametrize("horizon", [1, 3])
+def test_routes_stay_on_the_cropped_floor(horizon: int) -> None:
+    """What the search sees ends near the agent; a wall there must not lead it over the edge."""
+    grid = known_floor((0.3, 0.5, -3.0, 3.0), (-3.0, 0.4, 0.4, 0.6))
+    way_map, far = WayMap(grid), to_cells(np.array([[3.9, 3.9], [-3.9, -3.9], [2.1, 0.1]]))
+    ways = way_map.measure_ways(np.zeros((1, 2)))
+    plans = list_candidates(grid, way_map, ways, np.array([0.0, 0.0, 0.3]), [int(cell) for cell in far], horizon)
+    assert {len(plan.actions) for plan in plans} == {horizon}
+    floor = crop_floor(grid, np.zeros(3), 0.5)
+    assert floor.occupied[:3].all() and floor.occupied[:, -3:].all() and floor.free[8, 8]
 
 
 def test_where_no_way_leads_anywhere_the_agent_looks_around() -> None:

@@ -47,6 +47,8 @@ class NavigatorOptions:
     """Weight of estimated distances."""
     similarity: float = 0.5
     """Weight of the matcher's similarity beside the network's distance."""
+    likeness: float = 4.0
+    """Weight of the likeness of colours in a direction beside the network's bearing."""
     doubt: float = 0.15
     """Probability that a bearing says nothing."""
     overlap: float = 0.5
@@ -214,7 +216,9 @@ class Navigator(Policy):
         self, memory: Memory, frame: NDArray[np.uint8], view: str, pose: NDArray[np.float64], trust: float
     ) -> Evidence:
         """Return what a panorama, or a front view, says of the goal."""
-        bearings, closeness = self._estimator.rate(memory.goal, memory.template, frame, view, self.options.similarity)
+        bearings, closeness = self._estimator.rate(
+            memory.goal, memory.template, frame, view, self.options.similarity, self.options.likeness
+        )
         return Evidence(pose, bearings, closeness, trust)
 
     # -- plans ---------------------------------------------------------------------------------------------------------

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from wiw.action import FORWARD, TURN_LEFT, to_trajectory
 from wiw.mapping.occupancy import CELL, OccupancyGrid
 from wiw.mapping.routes import HEADINGS, STEP, TURN, follow_heading, route
-from wiw.policies.navigator.ways import WayMap, Ways, find_near, get_centres
+from wiw.policies.navigator.ways import WayMap, Ways, crop_layer, find_blocked, find_near, get_centres
 
 ARRIVAL = 0.45
 """Metres from the goal within which the agent has arrived."""
@@ -20,6 +20,8 @@ RADIUS = 0.15
 """Metres from its target within which a route ends."""
 LEEWAY = 5
 """Steps beyond the horizon to which a route may swerve."""
+FRAME = 3
+"""Cells at the edge of a cropped floor that are blocked, so that no route steps over it."""
 LOOK_AROUND = 4
 """Turns of a plan where no way leads anywhere."""
 
@@ -81,19 +83,13 @@ def list_candidates(
 
 
 def crop_floor(grid: OccupancyGrid, pose: NDArray[np.float64], reach: float) -> OccupancyGrid:
-    """Return the part of a map around the agent, with what is unknown taken for floor."""
-    center, half = np.floor(pose[:2] / CELL).astype(int), int(reach / CELL) + 1
-    layers = []
-    for layer in (grid.free, grid.occupied):
-        shown = np.zeros((2 * half, 2 * half), bool)
-        shift = np.array(grid.origin) - (center - half)
-        low, high = np.maximum(shift, 0), np.minimum(shift + layer.shape, 2 * half)
-        own = tuple(slice(a - s, b - s) for a, b, s in zip(low, high, shift, strict=True))
-        shown[low[0] : high[0], low[1] : high[1]] = layer[own]
-        layers.append(shown)
-    free, occupied = layers
-    origin = int(center[0] - half), int(center[1] - half)
-    return OccupancyGrid(origin=origin, free=free | ~occupied, occupied=occupied, walls=np.zeros_like(free))
+    """Return the part of a map around the agent, with what is unknown taken for floor, and a blocked frame."""
+    half = int(reach / CELL) + FRAME
+    row, column = (int(cell) - half for cell in np.floor(pose[:2] / CELL))
+    inside = slice(FRAME, 2 * half - FRAME)
+    blocked = np.ones((2 * half, 2 * half), bool)
+    blocked[inside, inside] = crop_layer(grid, find_blocked(grid), (row, column), 2 * half)[inside, inside]
+    return OccupancyGrid(origin=(row, column), free=~blocked, occupied=blocked, walls=np.zeros_like(blocked))
 
 
 def _find_stop(way_map: WayMap, ways: Ways, target: int, horizon: int) -> NDArray[np.float64]:

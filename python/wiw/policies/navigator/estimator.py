@@ -91,7 +91,13 @@ class GoalEstimator:
         return PlaceEstimates(bearings, distances, distances @ self.centres, visible)
 
     def rate(
-        self, goal: Features, template: appearance.GoalTemplate, frame: NDArray[np.uint8], view: str, similarity: float
+        self,
+        goal: Features,
+        template: appearance.GoalTemplate,
+        frame: NDArray[np.uint8],
+        view: str,
+        similarity: float,
+        likeness: float,
     ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
         """Return what a view says of the goal: the probability of each heading, float64 [32], and the logarithm of the
         likelihood ratio of each class of distance, float64 [9].
@@ -101,7 +107,8 @@ class GoalEstimator:
             template: the matcher's features of the goal.
             frame: uint8 [H, W, 3]: a panorama, or a front view with HFOV 90.
             view: "panorama", else it is a front view.
-            similarity: weight of the matcher's similarity, which is known of panoramas alone.
+            similarity: weight of the matcher's similarity in the distance; it is known of panoramas alone, as is
+            likeness: weight of the likeness of colours in the bearing: towards the goal much looks like it.
         """
         if view != "panorama":
             wide, mask = appearance.project_front(frame)
@@ -109,12 +116,12 @@ class GoalEstimator:
             return found.bearings[0], self._compare_with_prior(found.distances[0])
         small = resize_panoramas(frame[None])
         found = self.estimate(goal, small[:, BAND_ROWS])
-        closeness = self._compare_with_prior(found.distances[0])
-        if similarity:
-            profile = appearance.similarity(appearance.extract_features(small), template)
-            value = float(np.clip(profile.max(), 0, appearance.HIGHEST))
-            closeness = closeness + similarity * self._rate_similarity(value)
-        return found.bearings[0], closeness
+        features = appearance.extract_features(small)
+        value = float(np.clip(appearance.similarity(features, template).max(), 0, appearance.HIGHEST))
+        closeness = self._compare_with_prior(found.distances[0]) + similarity * self._rate_similarity(value)
+        colors = appearance.histogram_similarity(features, template)[0].reshape(len(found.bearings[0]), -1).mean(axis=1)
+        bearings = (found.bearings[0] + LEAST_SHARE) * np.exp(likeness * colors)
+        return bearings / bearings.sum(), closeness
 
     def _compare_with_prior(self, distances: NDArray[np.float64]) -> NDArray[np.float64]:
         return np.log((distances + LEAST_SHARE) / (self._shares + LEAST_SHARE))

@@ -6,10 +6,12 @@ from __future__ import annotations
 from dataclasses import dataclass
 from functools import cache
 
+import cv2
 import numpy as np
 from numpy.typing import NDArray
 from scipy import sparse
 from scipy.sparse import csgraph
+from scipy.spatial.distance import cdist
 
 from wiw.mapping.occupancy import CELL as FINE
 from wiw.mapping.occupancy import OccupancyGrid
@@ -22,6 +24,8 @@ RAYS, RAY_STEP = 256, 0.1
 """Directions in which sight is measured, and metres between the points along each."""
 UNKNOWN_COST = 1.3
 """Metres that one of unknown floor counts."""
+CLOSE = 1.0
+"""Metres within which the floor around the agent is seen."""
 OCTILE = 0.96
 """Length of a way over its length by steps to eight neighbours, on average."""
 
@@ -46,7 +50,8 @@ class WayMap:
     """Cells of 0.2 m within 9 m of the start, in its frame: rows along x, columns along y; flat arrays."""
 
     def __init__(self, grid: OccupancyGrid) -> None:
-        standable, occupied, known = (_coarsen(grid, layer) for layer in (grid.standable, grid.occupied, grid.known))
+        blocked = find_blocked(grid)
+        standable, occupied, known = (_coarsen(grid, layer) for layer in (grid.standable, blocked, grid.known))
         self.open = standable.any(axis=-1)
         """bool [side, side]: where the agent is known to fit."""
         self.unknown = ~self.open & ~occupied.any(axis=-1) & ~known.all(axis=-1)
@@ -110,17 +115,40 @@ class WayMap:
         return sparse.csr_array((np.concatenate(lengths), edges), shape=(SIDE * SIDE, SIDE * SIDE))
 
 
+def find_blocked(grid: OccupancyGrid) -> NDArray[np.bool_]:
+    """Return the cells of a map, bool [rows, columns], that are occupied, or must be for all that is known.
+
+    From close by the floor is seen unless something is in the way: where known floor ends there, the way does, too.
+    """
+    edge = ~grid.known & cv2.dilate(grid.free.view(np.uint8), np.ones((3, 3), np.uint8)).view(bool)
+    cells = np.argwhere(edge)
+    if not len(cells):
+        return grid.occupied
+    near = cdist(grid.to_points(cells), np.array(grid.visits).reshape(-1, 2)).min(axis=1, initial=np.inf) < CLOSE
+    blocked = grid.occupied.copy()
+    blocked[tuple(cells[near].T)] = True
+    return blocked
+
+
 def _coarsen(grid: OccupancyGrid, layer: NDArray[np.bool_]) -> NDArray[np.bool_]:
     """Return a layer's values in each cell of the way map: bool [side, side, 4]; False outside of the grid."""
     factor = round(CELL / FINE)
-    size = SIDE * factor
-    fine = np.zeros((size, size), bool)
-    shift = size // 2 + np.array(grid.origin)
-    low, high = np.maximum(shift, 0), np.minimum(shift + layer.shape, size)
+    fine = crop_layer(grid, layer, (-SIDE * factor // 2, -SIDE * factor // 2), SIDE * factor)
+    return fine.reshape(SIDE, factor, SIDE, factor).transpose(0, 2, 1, 3).reshape(SIDE, SIDE, -1)
+
+
+def crop_layer(grid: OccupancyGrid, layer: NDArray[np.bool_], first: tuple[int, int], side: int) -> NDArray[np.bool_]:
+    """Return a square of a grid's layer, bool [side, side], from row and column `first` on; False outside of the grid.
+
+    Rows and columns are counted from the start's.
+    """
+    cropped = np.zeros((side, side), bool)
+    shift = np.array(grid.origin) - first
+    low, high = np.maximum(shift, 0), np.minimum(shift + layer.shape, side)
     if (low < high).all():
         own = tuple(slice(a - s, b - s) for a, b, s in zip(low, high, shift, strict=True))
-        fine[low[0] : high[0], low[1] : high[1]] = layer[own]
-    return fine.reshape(SIDE, factor, SIDE, factor).transpose(0, 2, 1, 3).reshape(SIDE, SIDE, -1)
+        cropped[low[0] : high[0], low[1] : high[1]] = layer[own]
+    return cropped
 
 
 def to_cells(points: NDArray[np.float64]) -> NDArray[np.intp]:
