@@ -188,8 +188,9 @@ def _choose_places(scene: GoalPlaces, recipe: Recipe, rng: np.random.Generator) 
         weights = np.exp(-np.nan_to_num(scene.distances[first].astype(np.float64), posinf=50.0)) + 1e-9
         size = min(recipe.cluster, recipe.places - len(rows), len(scene))
         weights[first] = 0
-        near = rng.choice(len(scene), size - 1, replace=False, p=weights / weights.sum()) if size > 1 else []
-        rows += [first, *(int(i) for i in near)]
+        rows.append(first)
+        if size > 1:
+            rows += [int(i) for i in rng.choice(len(scene), size - 1, replace=False, p=weights / weights.sum())]
     return np.array(rows)
 
 

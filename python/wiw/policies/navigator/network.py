@@ -23,7 +23,7 @@ DISTANCES = (0.5, 1.0, 1.5, 2.0, 3.0, 4.0, 5.5, 7.5)
 """Metres between the classes of distance."""
 CENTRES = (0.25, 0.75, 1.25, 1.75, 2.5, 3.5, 4.75, 6.5, 9.0)
 """Metres in the middle of each class."""
-DILATIONS = (1, 2, 4, 8)
+KERNELS, DILATIONS = (5, 3, 3, 3, 3), (1, 2, 4, 8)
 
 
 @dataclass(frozen=True)
@@ -68,7 +68,8 @@ class Network(nn.Module):
         super().__init__()
         self.width, self.heads = width, heads
         sizes = [(4, width, 2), (width, width, 1), (width, 2 * width, 2), *[(2 * width, 2 * width, 1)] * 2]
-        self.trunk = nn.ModuleList(nn.Conv2d(a, b, 5 if a == 4 else 3, stride) for a, b, stride in sizes)
+        kernels = zip(sizes, KERNELS, strict=True)
+        self.trunk = nn.ModuleList(nn.Conv2d(a, b, kernel, stride) for (a, b, stride), kernel in kernels)
         self.norms = nn.ModuleList(nn.GroupNorm(4, b) for _, b, _ in sizes)
         self.key = nn.Conv2d(2 * width, heads * 8, 1)
         self.context = nn.Conv1d(2 * width * ROWS, 8, 1)
@@ -88,8 +89,8 @@ class Network(nn.Module):
     def encode(self, views: Tensor) -> Features:
         """Encode N views [N, 4, 32, W] of `to_input`: panoramas where W is 128, else goals, which have borders."""
         around, found = views.shape[3] == 4 * HEADINGS, views
-        for layer, norm in zip(self.trunk, self.norms, strict=True):
-            found = functional.relu(norm(layer(_pad(found, layer.kernel_size[0] // 2, around))))
+        for layer, norm, kernel in zip(self.trunk, self.norms, KERNELS, strict=True):
+            found = functional.relu(norm(layer(_pad(found, kernel // 2, around))))
         keys = self.key(found).unflatten(1, (self.heads, 8))
         colors = functional.avg_pool2d(views[:, :3], (8, 4))
         return Features(functional.normalize(keys, dim=2), self.context(found.flatten(1, 2)), colors)
