@@ -9,7 +9,7 @@ belief, and with it the worth of all plans.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import asdict, dataclass, field, fields, replace
+from dataclasses import asdict, dataclass, field, replace
 from hashlib import blake2b
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -27,6 +27,7 @@ from wiw.policies.navigator.belief import Evidence, Weights, compute_belief, fin
 from wiw.policies.navigator.candidates import Candidate, choose_apart, list_candidates, make_candidate, measure_arrivals
 from wiw.policies.navigator.estimator import GoalEstimator, require_torch
 from wiw.policies.navigator.ways import WayMap, Ways, find_near, get_centres
+from wiw.policies.options import read_numbers
 from wiw.types import Goal, Key, Proposal, Rollout
 
 if TYPE_CHECKING:
@@ -125,7 +126,7 @@ class Navigator(Policy):
         require_torch()
         from wiw.policies.navigator.weights import load
 
-        self.options = _read_options(options)
+        self.options = read_numbers("navigator", NavigatorOptions, options)
         file = Path(WEIGHTS if weights is None else weights).expanduser()
         self._use_network(*load(file), blake2b(file.read_bytes(), digest_size=8).hexdigest())
 
@@ -133,7 +134,7 @@ class Navigator(Policy):
     def from_network(cls, network: Network, card: dict[str, Any], **options: Any) -> Navigator:
         """Make the policy of a network in memory, such as one in training; `card` has what `measure_prior` returns."""
         policy = cls.__new__(cls)
-        policy.options = _read_options(options)
+        policy.options = read_numbers("navigator", NavigatorOptions, options)
         policy._use_network(network, card, "")
         return policy
 
@@ -283,18 +284,3 @@ def _interpolate(places: NDArray[np.float64]) -> NDArray[np.float64]:
 def _measure_gap(pose: NDArray[np.float64], others: Sequence[Evidence]) -> float:
     """Return the metres from a place to the nearest of others."""
     return min((float(np.hypot(*(pose - other.pose)[:2])) for other in others), default=np.inf)
-
-
-def _read_options(given: dict[str, Any]) -> NavigatorOptions:
-    """Return the options, checked.
-
-    Raises:
-        ArgumentError: an unknown one, or no number.
-    """
-    known = [each.name for each in fields(NavigatorOptions)]
-    for name, value in given.items():
-        if name not in known:
-            raise ArgumentError(f"policy navigator: unknown option '{name}'; there are {', '.join(known)}")
-        if isinstance(value, bool) or not isinstance(value, int | float):
-            raise ArgumentError(f"policy navigator: expected a number for {name}, got {value!r}")
-    return NavigatorOptions(**given)

@@ -95,7 +95,7 @@ class WayMap:
 
     def _build_graph(self, sources: NDArray[np.intp]) -> sparse.csr_array:
         """Build the graph of steps to eight neighbours; places stand where they are, whatever the map says."""
-        passable = self.open | self.unknown
+        passable: NDArray[np.bool_] = np.asarray(self.open | self.unknown)
         passable.ravel()[sources] = True
         cost = np.where(self.unknown, UNKNOWN_COST, 1.0)
         index = np.arange(SIDE * SIDE, dtype=np.int32).reshape(SIDE, SIDE)
