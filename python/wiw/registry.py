@@ -271,6 +271,7 @@ POLICIES = Registry(
         "matcher": "wiw.policies.matcher:Matcher",
         "climber": "wiw.policies.matcher.climber:Climber",
         "geometric": "wiw.policies.geometric:Geometric",
+        "navigator": "wiw.policies.navigator:Navigator",
         "recogniser": "wiw.policies.recogniser:Recognition",
         "vlm": "wiw.policies.vlm.make:make_vlm",
         "scripted": "wiw.policies.scripted:Scripted",

@@ -13,7 +13,7 @@ from blame_parts import AHEAD, FAN, SPIN, Noise, Spinner, Writer
 
 import wiw
 from recognition_file import a_file
-from wiw.action import FORWARD, TURN_LEFT
+from wiw.action import FORWARD, TURN_LEFT, TURN_RIGHT
 from wiw.datasets import ar
 from wiw.datasets.visibility import measure_sizes, visible_fraction
 from wiw.errors import ArgumentError
@@ -77,13 +77,13 @@ def test_worth_is_primitives_to_go_and_best_within_reach(two_rooms: str) -> None
     env = begin_env(ImageNav(scenes=two_rooms, backend="cpu"))
     guide, start = env.guide(), env.state.geodesic_to_goal()
     plan = guide.suggest_plan(20)
-    worths = [guide.evaluate_plan(plan[:k]) for k in range(1, 21)]
-    assert worths == sorted(worths) and -worths[0] >= start / 0.2 - 1
-    on_the_way = guide.evaluate_plan(plan)
-    assert guide.evaluate_plan([*plan, *[TURN_LEFT] * 8]) >= on_the_way  # where it goes afterwards takes nothing away
-    env.run(plan)
-    while not env.state.ended:
-        env.run(env.guide().suggest_plan(5)[:3])
+    worths = [guide.evaluate_plan(plan[:k]) for k in range(1, 11)]
+    assert worths[0] < worths[4] < worths[-1] and -worths[0] >= start / 0.2 - 1
+    assert guide.evaluate_plan([*plan[:5], *[TURN_LEFT] * 8]) < worths[4] - 3  # it ends with its back to the goal
+    while env.guide().evaluate_plan(last := env.guide().suggest_plan(5)) < 0:
+        env.run(last[:3])
+    assert env.guide().evaluate_plan([*last, *[FORWARD] * 8]) == 0  # the episode ends where the goal is reached
+    env.run(last)
     assert env.guide().evaluate_plan([TURN_LEFT]) == 0
 
 
@@ -123,6 +123,23 @@ def test_scoring_follows_the_truth_whatever_policies_say(two_rooms: str) -> None
     assert own.chosen is not None and len(own.actions) > 1
     unconsulted = decide(with_true_scores(Noise(), Gated(wiw.world_model("oracle"), 0.0)), env)
     assert unconsulted.rollouts is None and unconsulted.scores.tolist() == worths
+
+
+def test_only_what_is_carried_out_is_scored(two_rooms: str) -> None:
+    """A plan that dithers before it goes far would be begun again and again, and never be gone on with."""
+    env = begin_env(ImageNav(scenes=two_rooms, backend="cpu"))
+    true = env.guide().suggest_plan(8)
+
+    class Dithering(Noise):
+        plans = ([TURN_LEFT, TURN_RIGHT, TURN_LEFT, TURN_RIGHT, *true], true[:5])
+
+    numbers: dict[str, Any] = {"candidates": 2, "horizon": 12, "execute": 3}
+    recipe = AgentRecipe(Dithering(), "copy", ground_truth=["scoring"], **numbers)
+    decision = decide(recipe.build(RunContext(env.task)), env)
+    far, near = (env.guide().evaluate_plan(plan) for plan in Dithering.plans)
+    assert far > near and decision.chosen == 1
+    parts = [env.guide().evaluate_plan(plan[:3]) for plan in Dithering.plans]
+    np.testing.assert_array_equal(decision.scores, parts)
 
 
 def test_deeper_beams_are_scored_by_the_truth(two_rooms: str) -> None:

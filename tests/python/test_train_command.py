@@ -11,7 +11,7 @@ from wiw.cli.app import main
 from wiw.errors import ArgumentError
 from wiw.training.trainer import run_training, warmup_cosine_schedule
 
-NETWORKS = ("recogniser", "warpnet", "pocket", "perception", "armnet", "diffuser")
+NETWORKS = ("recogniser", "navigator", "warpnet", "pocket", "perception", "armnet", "diffuser")
 
 
 def test_both_helps_name_all_networks(capsys: pytest.CaptureFixture[str]) -> None:
@@ -20,7 +20,7 @@ def test_both_helps_name_all_networks(capsys: pytest.CaptureFixture[str]) -> Non
             main(command)
         assert end.value.code == 0
         text = " ".join(capsys.readouterr().out.replace("│", " ").split())
-        assert "recogniser, warpnet, pocket, perception, armnet, diffuser or a video model" in text
+        assert "recogniser, navigator, warpnet, pocket, perception, armnet, diffuser or a video model" in text
 
 
 @pytest.mark.parametrize("what", NETWORKS)

@@ -13,7 +13,7 @@ import pytest
 
 from wiw.cli.app import main
 from wiw.datasets.ar import EpisodeRules
-from wiw.datasets.imagenav import camera_pose
+from wiw.datasets.cameras import camera_pose
 from wiw.datasets.worlds import world
 from wiw.errors import ArgumentError
 from wiw.perception.glimpses import SIDE, Glimpses

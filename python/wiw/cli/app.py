@@ -90,7 +90,11 @@ COMMANDS: tuple[tuple[Callable[..., int], str, str], ...] = (
     (doctor, "doctor", "Check this machine, with a remedy for what is missing."),
     (serve_vlm, "serve-vlm", "Serve a small vision-language model on this machine, for tests."),
     (episodes, "episodes", "Write episodes to a file, so that anyone can run them."),
-    (train, "train", "Train a network: recogniser, warpnet, pocket, perception, armnet, diffuser or a video model."),
+    (
+        train,
+        "train",
+        "Train a network: recogniser, navigator, warpnet, pocket, perception, armnet, diffuser or a video model.",
+    ),
 )
 
 

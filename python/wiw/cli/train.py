@@ -20,8 +20,14 @@ from wiw.training.launcher import ProcessLayout, require_single_process
 
 ONE_PROCESS = ProcessLayout()
 DEFAULT_SCENES, DEFAULT_VAL, DEFAULT_PLAYS, DEFAULT_WORKERS = "apartments:train:80", "apartments:val:20", 2000, 2
-MORE_SCENES = "apartments:train:160"
-ON_SCENES, ON_PLAYS, ON_DEMONSTRATIONS = ("recogniser", "warpnet", "perception"), ("armnet",), ("armnet", "diffuser")
+SCENES = {
+    "recogniser": "apartments:train:160",
+    "perception": "apartments:train:160",
+    "navigator": "apartments:train:200",
+}
+"""Training scenes of the networks that do not use `DEFAULT_SCENES`."""
+ON_SCENES = ("recogniser", "warpnet", "perception", "navigator")
+ON_PLAYS, ON_DEMONSTRATIONS = ("armnet",), ("armnet", "diffuser")
 ON_DATA = (*VIDEO, "pocket")
 USES: Mapping[str, tuple[tuple[str, ...], str]] = {
     "scenes": (ON_SCENES, "does not train on scenes"),
@@ -53,7 +59,7 @@ USES: Mapping[str, tuple[tuple[str, ...], str]] = {
 def train(
     what: Positional[
         Annotated[
-            Literal["recogniser", "warpnet", "pocket", "perception", "armnet", "diffuser", VideoName],
+            Literal["recogniser", "navigator", "warpnet", "pocket", "perception", "armnet", "diffuser", VideoName],
             arg(metavar="WHAT"),
         ]
     ] = "recogniser",
@@ -83,10 +89,13 @@ def train(
     layout: Annotated[ProcessLayout, arg(name="")] = ONE_PROCESS,
     dry_run: bool = False,
 ) -> int:
-    """Train a network: recogniser, warpnet, pocket, perception, armnet, diffuser or a video model (NAME-action).
+    """Train a network: recogniser, navigator, warpnet, pocket, perception, armnet, diffuser or a video model
+    (NAME-action).
 
     recogniser: the policy of Active Recognition; it recognises the object in a red box from any number of real and
     imagined views. Trained on scenes.
+    navigator: the policy of Image-Goal Navigation that estimates, from a panorama and the goal image, how far the goal
+    is and in which direction. Trained on scenes.
     warpnet: a world model of navigation; it predicts the panorama that is seen from a place nearby. Trained on scenes.
     pocket: a world model of navigation, too: a small video diffusion model that draws all views of a plan together.
     Trained on a dataset of `wiw collect navigation`, without pretrained weights.
@@ -102,6 +111,8 @@ def train(
 
     $ wiw train recogniser --out recogniser.safetensors
     $ wiw train recogniser --scenes house.glb --val other.glb --categories chair bed --out house.safetensors
+    $ wiw train navigator --out navigator.safetensors
+    $ wiw run imagenav --policy navigator --policy-option weights=navigator.safetensors
     $ wiw train warpnet --out warpnet.safetensors
     $ wiw run imagenav --world-model warpnet --world-model-option weights=warpnet.safetensors
     $ wiw train perception --out perception.safetensors
@@ -121,20 +132,23 @@ def train(
     First the training data is prepared from scenes or plays and cached, so that an interrupted command does not
     prepare it again. Training then takes 15 to 30 minutes on two idle cores; perception takes one to two hours,
     pocket takes two to three hours, diffuser takes a night; less with --minutes, or with --option clips=N for
-    pocket. An interrupted training of perception, pocket, armnet, diffuser or a video model resumes from its
+    pocket. An interrupted training of navigator, perception, pocket, armnet, diffuser or a video model resumes from its
     checkpoint beside FILE; repeat the command. pocket and video models also write it at SIGUSR1.
 
     The file also holds the recipe and the figures on held-out data: for recogniser, accuracy and calibration error on
-    one half of the val scenes, after calibration on the other half; for warpnet, PSNR and SSIM on the val scenes,
-    beside copy and warp; for pocket, PSNR on windows of the val scenes, beside what has learnt nothing, and how much of
-    it is lost where it is told another window's places; for perception, accuracy and IoU of categories, accuracy of
-    states and of colour words on the val scenes; for armnet, errors on held-out plays, beside copy and a table where
-    nothing but the arm moves. diffuser is not evaluated. The weights shipped with wiw were trained by this command with
-    its defaults; those of perception for four epochs of a schedule that was first laid out for six
-    (docs/perception.md), those of pocket on 16 800 clips, those of recogniser by an earlier recipe (docs/results.md).
+    one half of the val scenes, after calibration on the other half; for navigator, how well it tells near pairs of
+    places of the val scenes from far ones and how far its bearings are off, beside the matcher's similarity; for
+    warpnet, PSNR and SSIM on the val scenes, beside copy and warp; for pocket, PSNR on windows of the val scenes,
+    beside what has learnt nothing, and how much of it is lost where it is told another window's places; for
+    perception, accuracy and IoU of categories, accuracy of states and of colour words on the val scenes; for armnet,
+    errors on held-out plays, beside copy and a table where nothing but the arm moves. diffuser is not evaluated. The
+    weights shipped with wiw were trained by this command with its defaults; those of perception for four epochs of a
+    schedule that was first laid out for six (docs/perception.md), those of navigator for three of four
+    (docs/navigation-tasks.md), those of pocket on 16 800 clips, those of recogniser by an earlier recipe
+    (docs/results.md).
 
     Args:
-        what: recogniser, warpnet, pocket, perception, armnet, diffuser or a video model.
+        what: recogniser, navigator, warpnet, pocket, perception, armnet, diffuser or a video model.
         out: Weights, a safetensors file of a few MB. Default: WHAT.safetensors. For video models a new folder. Default:
             WHAT.
         data: Dataset for pocket and video models: a folder of `wiw collect navigation`; for video models also of `wiw
@@ -154,17 +168,17 @@ def train(
             plans agrees with the true one.
         tracker: Program that draws loss and validation of pocket or a video model; needs its package.
             OUT.log/metrics.jsonl has the same in any case.
-        scenes: Training scenes of recogniser, warpnet and perception: apartments:train[:N], a mesh or a Gazebo world.
-            Default: apartments:train:160; 80 of them for warpnet.
-        val: Held-out scenes of recogniser, warpnet, pocket and perception. recogniser splits them, or the samples of a
-            single one, into halves for calibration and evaluation. Default: apartments:val:20.
+        scenes: Training scenes of recogniser, navigator, warpnet and perception: apartments:train[:N], a mesh or a
+            Gazebo world. Default: apartments:train:160; 80 of them for warpnet, 200 for navigator.
+        val: Held-out scenes of recogniser, navigator, warpnet, pocket and perception. recogniser splits them, or the
+            samples of a single one, into halves for calibration and evaluation. Default: apartments:val:20.
         categories: What recogniser tells apart. Default: the built-in list of 26 categories.
         demonstrations: Folder of `wiw collect manipulation`: with depth for diffuser; additional data for armnet.
         epochs: How often each sample is used, on average. Default: 25 for recogniser, 6 for warpnet, 1 for pocket, 4
-            for perception and armnet, 400 for diffuser.
+            for navigator, perception and armnet, 400 for diffuser.
         minutes: Train fewer epochs if all of them would take longer than this.
-        places: Places sampled in each scene, for recogniser (default: 8) and perception (default: 12), or walks
-            recorded in each scene, for warpnet (default: 24).
+        places: Places sampled in each scene, for recogniser (default: 8), perception (default: 12) and navigator
+            (default: 24, and up to three near each), or walks recorded in each scene, for warpnet (default: 24).
         plays: Simulated plays of armnet, of eight gripper poses each. Default: 2000.
         seed: Seed of the training data and of the weights.
         workers: Processes that prepare training data from scenes or plays. Default: 2.
@@ -200,7 +214,7 @@ def train(
     _require_torch(what)
     _check_out(out)
     source = _DataOptions(
-        scenes=scenes or (DEFAULT_SCENES if what == "warpnet" else MORE_SCENES),
+        scenes=scenes or SCENES.get(what, DEFAULT_SCENES),
         val=DEFAULT_VAL if val is None else val,
         seed=seed,
         cache=cache or folder().parent / "looks",
@@ -222,6 +236,8 @@ def train(
             train_pocket(out, data, source.cache, source.val, recipe, option, numbers, given, _show_bar)
         elif what == "perception":
             _train_perception(out, source, minutes, rules, lengths)
+        elif what == "navigator":
+            _train_navigator(out, source, minutes, places, lengths)
         else:
             _train_warpnet(out, source, minutes, rules, lengths)
     print(f"weights   {out} ({out.stat().st_size / 2**20:.2f} MB)")
@@ -251,6 +267,10 @@ def _require_torch(what: str) -> None:
         require_torch()
     elif what == "diffuser":
         from wiw.policies.diffuser import require_torch
+
+        require_torch()
+    elif what == "navigator":
+        from wiw.policies.navigator.estimator import require_torch
 
         require_torch()
     elif what == "perception":
@@ -360,6 +380,34 @@ def _train_perception(
     checkpoint.remove()
     _report_perception(card)
     print(f"colours   {colors}")
+
+
+def _train_navigator(
+    out: Path, data: _DataOptions, minutes: float | None, places: int | None, recipe_options: dict[str, Any]
+) -> None:
+    from wiw.networks import single_thread
+    from wiw.policies.navigator.weights import load, save
+    from wiw.training import navigator as training
+    from wiw.training.checkpoint import Checkpoint
+    from wiw.training.gather import gather_goal_places
+    from wiw.training.goal_places import PlaceRules
+
+    rules, recipe = PlaceRules(**_drop_none({"anchors": places})), training.Recipe(seed=data.seed, **recipe_options)
+    scenes = gather_goal_places(data.scenes, data.seed, rules, **data.gathering)
+    held_out = gather_goal_places(data.val, data.seed, rules, **data.gathering)
+    card: dict[str, Any] = {"scenes": data.scenes, "val": data.val, "places": sum(map(len, scenes))}
+    card |= {"sampling": asdict(rules)}
+    checkpoint = Checkpoint(
+        out.with_name(f"{out.name}.checkpoint"), {**card, "recipe": asdict(recipe), "minutes": minutes}
+    )
+    with single_thread(), _StepBar() as steps:
+        network, recipe = training.train(scenes, recipe, minutes, steps, checkpoint)
+    card |= {"recipe": asdict(recipe), **training.measure_prior(scenes, recipe)}
+    save(out, network, card)  # before the evaluation, which takes another minute
+    card["held_out"] = training.evaluate(load(out)[0], card, held_out, data.seed)  # as stored, in half precision
+    save(out, network, card)
+    checkpoint.remove()
+    _report_navigator(card)
 
 
 def _train_diffuser(
@@ -510,6 +558,20 @@ def _report_warpnet(card: dict[str, Any]) -> None:
         cells = [f"{held_out['psnr'][name][n]:8.1f} {held_out['ssim'][name][n]:6.3f}" for n in held_out["psnr"][name]]
         print(f"  {name:<18}" + "".join(cells))
     print("PSNR in dB and SSIM of whole panoramas, weighted by latitude")
+
+
+def _report_navigator(card: dict[str, Any]) -> None:
+    held_out, other = card["held_out"], "the matcher's similarity"
+    print(f"{card['places']} places, {card['recipe']['epochs']} epochs; held out: {held_out['pairs']} pairs")
+    auc = held_out["auc"]
+    print(f"AUC within 2 m: network {auc['network']:.3f}, {other} {auc['similarity']:.3f}, both {auc['both']:.3f}")
+    for name, row in held_out["bearing"].items():
+        if not row["pairs"]:
+            continue
+        print(
+            f"  bearing, {name:<5} m: median error {row['network']:3.0f} degrees, {other} {row['similarity']:3.0f}; "
+            f"within 45: {_to_percent(row['within_45'])} of {row['pairs']}"
+        )
 
 
 def _report_perception(card: dict[str, Any]) -> None:

@@ -41,7 +41,9 @@ class Guide(ABC):
 
     @abstractmethod
     def evaluate_plan(self, plan: NDArray[Any]) -> float:
-        """Return how good a plan truly is: the best progress after any of its actions, the higher the better."""
+        """Return how good a plan truly is, the higher the better: the progress at its end, or where it gets all the way
+        before that.
+        """
 
     @abstractmethod
     def suggest_plan(self, length: int) -> NDArray[Any]:

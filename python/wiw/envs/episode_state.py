@@ -26,6 +26,8 @@ class NavigationSpec(ABC):
     backend: Literal["auto", "cpu", "gpu"]
     choices: tuple[str, ...] = ()
     """Labels that answers are chosen from, where the task asks for any."""
+    complete_progress: float = float("inf")
+    """Progress with which an episode has ended, whatever a plan would do afterwards; inf where places do not end it."""
 
     @property
     def free_turns(self) -> bool:

@@ -20,6 +20,8 @@ class ManipulationSpec(ABC):
     seed: int
     robot: Robot
     """The arm."""
+    complete_progress: float = 0.0
+    """Progress with which an episode has ended, whatever a plan would do afterwards."""
 
     @property
     @abstractmethod

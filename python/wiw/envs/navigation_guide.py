@@ -96,12 +96,14 @@ class NavigationGuide(Guide):
     path: ShortestPath
 
     def evaluate_plan(self, plan: Sequence[int] | NDArray[np.int8]) -> float:
-        """Return the most progress that a plan makes, by the task's progress after each of its primitives."""
-        probe, found = self.fork.fork(), []
+        """Return the task's progress at a plan's end, or at the first primitive that gets all the way."""
+        probe, found = self.fork.fork(), -np.inf
         for action in plan:
             probe.step(int(action))
-            found.append(self.task.measure_progress(self.state, probe, self.path.count_primitives(probe)))
-        return max(found)
+            found = self.task.measure_progress(self.state, probe, self.path.count_primitives(probe))
+            if found >= self.task.complete_progress:
+                break
+        return found
 
     def suggest_plan(self, length: int) -> NDArray[np.int8]:
         """Return the plan of an agent that knows the scene, int8 [length]."""

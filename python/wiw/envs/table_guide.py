@@ -24,12 +24,14 @@ class TableGuide(Guide):
     """A fork of the table's."""
 
     def evaluate_plan(self, plan: NDArray[np.float64]) -> float:
-        """Return the most progress that a plan makes, by the task's progress after each of its poses."""
-        probe, found = self.bench.fork(), []
+        """Return the task's progress at a plan's end, or at the first pose that gets all the way."""
+        probe, found = self.bench.fork(), -np.inf
         for pose in plan:
             probe.move_to(pose)
-            found.append(self.task.measure_progress(self.table, probe))
-        return max(found)
+            found = self.task.measure_progress(self.table, probe)
+            if found >= self.task.complete_progress:
+                break
+        return found
 
     def suggest_plan(self, length: int) -> NDArray[np.float64]:
         """Return the expert's next poses, float64 [K, 7], 1 <= K <= length; the present pose where nothing helps."""

@@ -2,7 +2,8 @@
 """Give stages of the loop the ground truth, to find out which of them causes a failure.
 
 imagination: the oracle stands in for the world model, or for the lack of one.
-scoring: plans are judged by how far they truly get, and the best one is followed; policies still score and remember.
+scoring: plans are judged by how far the part that is carried out truly gets, and the best one is followed; policies
+still score and remember.
 proposals: the plan of an agent that knows the scene leads the policy's own, as the one that the policy likes best; the
 policy's last one gives way where there would be too many. It still has to be recognised.
 """
@@ -16,6 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from wiw.errors import ArgumentError
+from wiw.loop.config import AgentConfig
 from wiw.loop.privileged import LiveEnvironments, Privileged
 from wiw.policies.base import Policy, Situation
 from wiw.policies.wrapper import PolicyWrapper
@@ -74,9 +76,19 @@ class TruePlans(_Guided):
 
 
 class TrueScores(_Guided):
-    """A reviser that knows the true progress of each plan, and follows the best."""
+    """A reviser that knows the true progress of each plan, and follows the best.
+
+    Args:
+        inner: the reviser that scores and remembers as it would without the truth.
+        config: of the agent. Plans are judged where the part that is carried out ends: an agent that is drawn by what
+            lies beyond it can turn to and fro for ever. None: where the whole plan ends.
+    """
 
     stage = "scoring"
+
+    def __init__(self, inner: Policy, config: AgentConfig | None = None) -> None:
+        super().__init__(inner)
+        self._config = None if config is None else config.complete()
 
     def score_or_prefer(
         self,
@@ -98,7 +110,11 @@ class TrueScores(_Guided):
 
     def _worths(self, key: Key, plans: Sequence[Proposal]) -> NDArray[np.float64]:
         guide = self._guide(key)
-        return np.array([guide.evaluate_plan(plan.actions) for plan in plans], np.float64)
+        parts = [plan.actions[: self._count_executed(len(plan.actions))] for plan in plans]
+        return np.array([guide.evaluate_plan(part) for part in parts], np.float64)
+
+    def _count_executed(self, length: int) -> int:
+        return length if self._config is None else self._config.count_executed(length)
 
 
 def _put_first(actions: NDArray[Any], plans: Sequence[Proposal], candidates: int) -> list[Proposal]:

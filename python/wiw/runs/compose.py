@@ -78,7 +78,7 @@ def compose(spec: AgentSpec, experiment: Experiment, limits: Limits, context: Ru
     if "scoring" in stages or "proposals" in stages:
         reviser = AgentSpec(policy, imaginer, reviser, config, ()).build().reviser
     if "scoring" in stages:
-        reviser = TrueScores(reviser)
+        reviser = TrueScores(reviser, config)
     if "proposals" in stages:
         policy = TruePlans(policy)
     oracle = imaginer.model.unwrapped if imaginer is not None and imaginer.model is not None else None

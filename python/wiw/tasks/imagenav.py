@@ -63,6 +63,7 @@ class ImageNav(NavigationTask):
     metrics = ("success", "spl", "mean_trajectory")
     rules_class = ImageNavRules
     generator_class = EpisodeRules
+    complete_progress = 0.0
     wording = Wording(
         succeeded="reached the goal", won="reached", lost="not reached", asked="The goal: find where this was taken"
     )

@@ -35,6 +35,7 @@ from wiw.training.glimpse_sets import (
     join_glimpse_sets,
     merge_glimpse_sets,
 )
+from wiw.training.goal_places import GoalPlaces, PlaceRules, record_goal_places, require_places
 from wiw.training.labelled_views import FIELDS as VIEW_FIELDS
 from wiw.training.labelled_views import LabelledViews, ViewRules, change_states, merge_views, record_views
 from wiw.training.walks import WalkRules, Walks, record_walks
@@ -63,6 +64,7 @@ class Job:
 
 GLIMPSE_SET_FIELDS = ("images", "boxes", "scalars", "owners", "kinds", "labels")
 WALK_FIELDS = ("images", "distances", "places")
+PLACE_FIELDS = ("bands", "depths", "distances", "bearings", "visible")
 
 
 def gather_glimpse_sets(
@@ -128,6 +130,21 @@ def gather_walks(specs: str, seed: int, rules: WalkRules, folder: Path, workers:
     )
 
 
+def gather_goal_places(
+    specs: str, seed: int, rules: PlaceRules, folder: Path, workers: int, bar: ProgressBar
+) -> Sequence[GoalPlaces]:
+    """Load the places of all scenes of a spec; build those that `folder` lacks in `workers` processes.
+
+    Raises:
+        FileError: the folder cannot be written.
+        ArgumentError: nowhere in the scenes can one walk from a place to another.
+    """
+    make = partial(_build_goal_places, seed=seed, rules=rules)
+    job = Job(f"places in {specs}", PLACE_FIELDS, make, ("goal places", 1, seed, asdict(rules)))
+    found = gather_arrays(_resolve_scenes(specs), job, folder, workers, bar)
+    return require_places([GoalPlaces(*(arrays[name] for name in PLACE_FIELDS)) for arrays in found])
+
+
 def gather_views(
     specs: str, seed: int, rules: ViewRules, folder: Path, workers: int, bar: ProgressBar, change: bool = False
 ) -> LabelledViews:
@@ -176,6 +193,11 @@ def _build_views(name: str, seed: int, rules: ViewRules) -> Arrays:
 def _build_walks(name: str, seed: int, rules: WalkRules) -> Arrays:
     walks = record_walks(world(name), seed, rules)
     return {name: getattr(walks, name) for name in WALK_FIELDS}
+
+
+def _build_goal_places(name: str, seed: int, rules: PlaceRules) -> Arrays:
+    places = record_goal_places(world(name), seed, rules)
+    return {field: getattr(places, field) for field in PLACE_FIELDS}
 
 
 def gather_arrays(sources: Mapping[str, str], job: Job, folder: Path, workers: int, bar: ProgressBar) -> list[Arrays]:

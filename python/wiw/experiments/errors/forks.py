@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from wiw.action import ActionSpace
-from wiw.datasets.imagenav import camera_pose
+from wiw.datasets.cameras import camera_pose
 from wiw.datasets.worlds import World
 
 LONGEST = ActionSpace().forward_m

@@ -4,7 +4,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import asdict, dataclass, field, fields, replace
+from dataclasses import asdict, dataclass, field, replace
 from typing import Any
 
 import numpy as np
@@ -12,10 +12,10 @@ from numpy.typing import NDArray
 
 from wiw import panorama
 from wiw.action import FORWARD, TURN_LEFT, TURN_RIGHT, to_trajectory
-from wiw.errors import ArgumentError
 from wiw.policies.base import FrameSpec, Policy, Situation
 from wiw.policies.matcher import appearance
 from wiw.policies.matcher.exploration import ExplorationMap
+from wiw.policies.options import read_numbers
 from wiw.types import Goal, Key, Proposal, Rollout
 
 HEADINGS = 16
@@ -92,13 +92,7 @@ class Matcher(Policy):
     frames = FrameSpec("panorama", appearance.PANORAMA)
 
     def __init__(self, **options: Any) -> None:
-        known = [field.name for field in fields(MatcherOptions)]
-        for name, value in options.items():
-            if name not in known:
-                raise ArgumentError(f"policy matcher: unknown option '{name}'; there are {', '.join(known)}")
-            if isinstance(value, bool) or not isinstance(value, int | float):
-                raise ArgumentError(f"policy matcher: expected a number for {name}, got {value!r}")
-        self.options = MatcherOptions(**options)
+        self.options = read_numbers("matcher", MatcherOptions, options)
 
     def describe(self) -> dict[str, Any]:
         """Return name and weights."""

@@ -19,11 +19,15 @@ PANORAMA = (64, 128)
 ROWS = slice(16, 48)
 COLUMNS = 128
 WINDOW = 32
+MIDDLE = slice(COLUMNS // 2 - WINDOW // 2, COLUMNS // 2 + WINDOW // 2)
+"""Columns of the front view."""
 BINS = (5, 16, 16)
 """Histogram bins of L, a, b."""
 LAYERS = 2
 """The band's upper and lower half have separate histograms: the floor is not the wall."""
 HISTOGRAM_WEIGHT = 2.0
+HIGHEST = HISTOGRAM_WEIGHT + 2.0
+"""Similarity of a place to itself. Where nothing but a bare wall is seen, rounding can lead beyond it."""
 
 
 @dataclass(frozen=True)
@@ -59,9 +63,13 @@ class GoalTemplate:
 def build_goal_template(image: NDArray[np.uint8]) -> GoalTemplate:
     """Extract features of a goal view uint8 [S, S, 3] with HFOV 90."""
     band, mask = project_front(image)
-    features = extract_features(band[None])
-    window = slice(COLUMNS // 2 - WINDOW // 2, COLUMNS // 2 + WINDOW // 2)
-    weights = mask[:, window].astype(np.float32)
+    return build_template(band, mask[:, MIDDLE])
+
+
+def build_template(goal: NDArray[np.uint8], mask: NDArray[np.bool_]) -> GoalTemplate:
+    """Extract features of a panorama uint8 [64, 128, 3] whose front is the goal; `mask` [32, 32] is what it shows."""
+    features, window = extract_features(goal[None]), MIDDLE
+    weights = mask.astype(np.float32)
     own, counts = np.unique(features.bins[0][:, window][weights > 0], return_counts=True)
     numbers = np.full(LAYERS * int(np.prod(BINS)), len(own), np.intp)
     numbers[own] = np.arange(len(own))
@@ -88,7 +96,7 @@ def extract_features(panoramas: NDArray[np.uint8]) -> Band:
 def similarity(places: Band, goal: GoalTemplate) -> NDArray[np.float32]:
     """Return float32 [N, 128]: 2 x histogram overlap + colour correlation + edge correlation, for each heading column.
 
-    Column c is the centre of the compared window; the highest possible value is 4.
+    Column c is the centre of the compared window.
     """
     score = HISTOGRAM_WEIGHT * histogram_similarity(places, goal)
     score += _correlation(places.colors, goal.colors, goal.mask)

@@ -1,0 +1,174 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Ways over a map whose unknown parts are taken for floor: how long they are, and in which direction they begin."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import cache
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+from scipy import sparse
+from scipy.sparse import csgraph
+from scipy.spatial.distance import cdist
+
+from wiw.mapping.occupancy import CELL as FINE
+from wiw.mapping.occupancy import OccupancyGrid
+
+CELL = 0.2
+"""Metres."""
+SIDE = 90
+"""Cells of the map's sides; the start is in its middle."""
+RAYS, RAY_STEP = 256, 0.1
+"""Directions in which sight is measured, and metres between the points along each."""
+UNKNOWN_COST = 1.3
+"""Metres that one of unknown floor counts."""
+CLOSE = 1.0
+"""Metres within which the floor around the agent is seen."""
+OCTILE = 0.96
+"""Length of a way over its length by steps to eight neighbours, on average."""
+
+
+@dataclass(frozen=True)
+class Ways:
+    """The shortest ways from N places to all cells."""
+
+    metres: NDArray[np.float64]
+    """float64 [N, cells]; inf where there is none."""
+    azimuths: NDArray[np.float64]
+    """float64 [N, cells]: direction in which it begins, straight to its first bend, in the frame of the start."""
+    before: NDArray[np.int32]
+    """int32 [N, cells]: the cell before each, itself where there is none."""
+
+    def take(self, rows: slice) -> Ways:
+        """Return some of the N places."""
+        return Ways(self.metres[rows], self.azimuths[rows], self.before[rows])
+
+
+class WayMap:
+    """Cells of 0.2 m within 9 m of the start, in its frame: rows along x, columns along y; flat arrays."""
+
+    def __init__(self, grid: OccupancyGrid) -> None:
+        blocked = find_blocked(grid)
+        standable, occupied, known = (_coarsen(grid, layer) for layer in (grid.standable, blocked, grid.known))
+        self.open = standable.any(axis=-1)
+        """bool [side, side]: where the agent is known to fit."""
+        self.unknown = ~self.open & ~occupied.any(axis=-1) & ~known.all(axis=-1)
+        """bool [side, side]: what may be floor."""
+
+    def measure_ways(self, places: NDArray[np.float64]) -> Ways:
+        """Measure the ways from places [N, 2] to all cells."""
+        sources = to_cells(places)
+        metres, before = csgraph.dijkstra(
+            self._build_graph(sources), directed=True, indices=sources, return_predecessors=True
+        )
+        own = np.arange(SIDE * SIDE, dtype=np.int32)
+        before = np.where(before < 0, own, before)
+        away = get_centres() - places[:, None]
+        straight, azimuths = np.hypot(*np.moveaxis(away, -1, 0)), np.arctan2(away[..., 1], away[..., 0])
+        visible = straight < self._measure_sight(places, azimuths) + CELL
+        bend = np.where(visible, own, before)
+        for _ in range(8):  # each doubles how far back along its way a cell looks for one in sight
+            bend = np.take_along_axis(bend, bend, axis=1)
+        return Ways(metres * OCTILE, np.take_along_axis(azimuths, bend, axis=1), before)
+
+    def _measure_sight(self, places: NDArray[np.float64], azimuths: NDArray[np.float64]) -> NDArray[np.float64]:
+        """Return how far one could go straight ahead from places [N, 2] at azimuths [N, cells]: float64 [N, cells]."""
+        angles = (np.arange(RAYS) + 0.5) * 2 * np.pi / RAYS - np.pi
+        steps = np.arange(CELL, SIDE * CELL / np.sqrt(2), RAY_STEP)
+        points = steps[:, None, None] * np.stack([np.cos(angles), np.sin(angles)], axis=1)
+        free = (self.open | self.unknown).ravel()
+        sight = np.empty(azimuths.shape)
+        for row, place in enumerate(places):
+            blocked = ~free[to_cells((place + points).reshape(-1, 2))].reshape(len(steps), RAYS)
+            reach = np.where(blocked.any(axis=0), steps[blocked.argmax(axis=0)], np.inf)
+            sight[row] = reach[((azimuths[row] + np.pi) / (2 * np.pi) * RAYS).astype(np.intp) % RAYS]
+        return sight
+
+    def trace(self, ways: Ways, row: int, cell: int) -> NDArray[np.intp]:
+        """Return the cells of the way from a place to a cell, both included."""
+        found = [cell]
+        while ways.before[row, found[-1]] != found[-1]:
+            found.append(int(ways.before[row, found[-1]]))
+        return np.array(found[::-1])
+
+    def _build_graph(self, sources: NDArray[np.intp]) -> sparse.csr_array:
+        """Build the graph of steps to eight neighbours; places stand where they are, whatever the map says."""
+        passable: NDArray[np.bool_] = np.asarray(self.open | self.unknown)
+        passable.ravel()[sources] = True
+        cost = np.where(self.unknown, UNKNOWN_COST, 1.0)
+        index = np.arange(SIDE * SIDE, dtype=np.int32).reshape(SIDE, SIDE)
+        heads, tails, lengths = [], [], []
+        for dr, dc in ((0, 1), (1, 0), (1, 1), (1, -1)):
+            a = slice(0, SIDE - dr), slice(max(0, -dc), SIDE - max(0, dc))
+            b = slice(dr, SIDE), slice(max(0, dc), SIDE - max(0, -dc))
+            free = passable[a] & passable[b]
+            if dr and dc:  # no step between two cells that touch at a corner
+                free &= passable[a[0], b[1]] & passable[b[0], a[1]]
+            length = CELL * np.hypot(dr, dc) * (cost[a] + cost[b])[free] / 2
+            heads += [index[a][free], index[b][free]]
+            tails += [index[b][free], index[a][free]]
+            lengths += [length, length]
+        edges = np.concatenate(heads), np.concatenate(tails)
+        return sparse.csr_array((np.concatenate(lengths), edges), shape=(SIDE * SIDE, SIDE * SIDE))
+
+
+def find_blocked(grid: OccupancyGrid) -> NDArray[np.bool_]:
+    """Return the cells of a map, bool [rows, columns], that are occupied, or must be for all that is known.
+
+    From close by the floor is seen unless something is in the way: where known floor ends there, the way does, too.
+    """
+    edge = ~grid.known & cv2.dilate(grid.free.view(np.uint8), np.ones((3, 3), np.uint8)).view(bool)
+    cells = np.argwhere(edge)
+    if not len(cells):
+        return grid.occupied
+    near = cdist(grid.to_points(cells), np.array(grid.visits).reshape(-1, 2)).min(axis=1, initial=np.inf) < CLOSE
+    blocked = grid.occupied.copy()
+    blocked[tuple(cells[near].T)] = True
+    return blocked
+
+
+def _coarsen(grid: OccupancyGrid, layer: NDArray[np.bool_]) -> NDArray[np.bool_]:
+    """Return a layer's values in each cell of the way map: bool [side, side, 4]; False outside of the grid."""
+    factor = round(CELL / FINE)
+    fine = crop_layer(grid, layer, (-SIDE * factor // 2, -SIDE * factor // 2), SIDE * factor)
+    return fine.reshape(SIDE, factor, SIDE, factor).transpose(0, 2, 1, 3).reshape(SIDE, SIDE, -1)
+
+
+def crop_layer(grid: OccupancyGrid, layer: NDArray[np.bool_], first: tuple[int, int], side: int) -> NDArray[np.bool_]:
+    """Return a square of a grid's layer, bool [side, side], from row and column `first` on; False outside of the grid.
+
+    Rows and columns are counted from the start's.
+    """
+    cropped = np.zeros((side, side), bool)
+    shift = np.array(grid.origin) - first
+    low, high = np.maximum(shift, 0), np.minimum(shift + layer.shape, side)
+    if (low < high).all():
+        own = tuple(slice(a - s, b - s) for a, b, s in zip(low, high, shift, strict=True))
+        cropped[low[0] : high[0], low[1] : high[1]] = layer[own]
+    return cropped
+
+
+def to_cells(points: NDArray[np.float64]) -> NDArray[np.intp]:
+    """Return the flat index of the cell that each of N points [N, 2] is in, or of the nearest one of the map."""
+    cells = np.clip(np.floor(np.asarray(points) / CELL).astype(np.intp) + SIDE // 2, 0, SIDE - 1)
+    return cells[:, 0] * SIDE + cells[:, 1]
+
+
+@cache
+def get_centres() -> NDArray[np.float64]:
+    """Return the middles of all cells in metres: float64 [cells, 2]."""
+    along = (np.arange(SIDE) - SIDE // 2 + 0.5) * CELL
+    return np.stack(np.meshgrid(along, along, indexing="ij"), axis=-1).reshape(-1, 2)
+
+
+def find_near(point: NDArray[np.float64], radius: float) -> NDArray[np.intp]:
+    """Return the cells whose middles are within `radius` metres of a point [2]."""
+    row, column = divmod(int(to_cells(point[None])[0]), SIDE)
+    reach = int(radius / CELL) + 1
+    rows = np.arange(max(0, row - reach), min(SIDE, row + reach + 1))
+    columns = np.arange(max(0, column - reach), min(SIDE, column + reach + 1))
+    cells = (rows[:, None] * SIDE + columns).ravel()
+    away = get_centres()[cells] - point
+    return cells[(away**2).sum(axis=1) < radius**2]
