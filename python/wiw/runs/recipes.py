@@ -454,8 +454,8 @@ def _make_arm(agent: AgentRecipe, name: str | None, model: Any) -> tuple[str, Ag
     arm = parse_arm(model or "none")
     if name is not None and arm.name is not None:
         raise ArgumentError(f"arms: '{model}' has the names '{name}' and '{arm.name}'; expected one of them")
-    policy, of_model = _split_policy(arm.model)
-    repeats, of_model = _split_repeat(of_model)
+    policy, text = _split_policy(arm.model)
+    repeats, of_model = _split_repeat(text)
     own = agent if policy is None else agent.with_policy(policy)
     changed = own if of_model is None else _change_model(own, of_model)
     changed = _with_options(replace(changed, reseed=1) if repeats else changed, arm)
