@@ -121,7 +121,7 @@ class Moved(ContentDegradation):
         angles = make_generator(seed).uniform(0, 2 * np.pi, len(bench.things))
         places = zip(bench.things, angles, strict=True)
         return DrawnBench(
-            bench, {name: shift(self.dose * np.cos(angle), self.dose * np.sin(angle), 0) for name, angle in places}
+            bench, {name: shift(self.dose * np.cos(angle), self.dose * np.sin(angle)) for name, angle in places}
         )
 
 
@@ -153,7 +153,7 @@ class Invented(ContentDegradation):
         places = generator.uniform(low, high, (len(names), 2))
         poses = bench.get_poses(names)
         offsets = {
-            name: shift(*(place - poses[name][:2, 3]), 0)
+            name: shift(*(place - poses[name][:2, 3]))
             for name, place, one in zip(names, places, drawn, strict=True)
             if one
         }
@@ -264,7 +264,7 @@ def _draw_floor(fork: WorldFork, count: int, generator: np.random.Generator) -> 
     return (places[near] if near.sum() >= count else places)[:count]
 
 
-def shift(x: float, y: float, z: float) -> NDArray[np.float64]:
+def shift(x: float, y: float, z: float = 0.0) -> NDArray[np.float64]:
     """Return a translation [4, 4]."""
     found = np.eye(4)
     found[:3, 3] = x, y, z

@@ -49,8 +49,8 @@ class MotionDegradation(Degradation):
             changed = [replace(own, ids=self._send_gripper(own.ids, int(seed))) for own, seed in pairs]
             return model.rollout(observations, changed, seeds)
         assert observations.simulators is not None
-        pairs = zip(observations.simulators, seeds, strict=True)
-        errant = [_ErrantFork(fork, self, int(seed)) for fork, seed in pairs]
+        forks = zip(observations.simulators, seeds, strict=True)
+        errant = [_ErrantFork(fork, self, int(seed)) for fork, seed in forks]
         return model.rollout(replace(observations, simulators=errant), controls, seeds)
 
     def misplace(self, simulator: Any, actions: NDArray[Any], seed: int) -> NDArray[np.float64]:
