@@ -268,7 +268,7 @@ def test_chosen_plans_end_apart_and_those_that_only_turn_come_last() -> None:
 @pytest.fixture(scope="module")
 def situate(two_rooms: str) -> Callable[..., Situation]:
     """Make the first situation of an episode, for a policy."""
-    env = wiw.make("ImageNav-v0", scenes=two_rooms, backend="cpu").unwrapped
+    env: Any = wiw.make("ImageNav-v0", scenes=two_rooms, backend="cpu").unwrapped
 
     def make(policy: Navigator, episode: int = 0, key: Key = KEY) -> Situation:
         found, _ = env.reset(options={"episode": episode})
