@@ -16,7 +16,7 @@ from wiw.errors import ArgumentError, FileError
 from wiw.studies.evaluate import run_arms
 
 EVIL = 'a,"b"\n/../c'
-TABLES = ("arms", "episodes", "outcomes", "decisions", "candidates")
+TABLES = ("arms", "episodes", "outcomes", "decisions", "candidates", "anytime", "anytime_differences")
 
 
 @pytest.fixture(scope="module")

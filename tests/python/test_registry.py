@@ -22,10 +22,16 @@ import wiw
 
 class Mine(wiw.WorldModel):
     accepts = wiw.accepts(control="image", causal=True)
-    steps = {steps}
 
     def rollout(self, observations, controls, seeds):
         return np.repeat(observations.image[:, None], len(controls[0].actions) + 1, 1)
+"""
+POLICY = """
+import wiw
+
+
+class Mine(wiw.Policy):
+    steps = {steps}
 """
 
 
@@ -35,46 +41,57 @@ def own_path(monkeypatch: pytest.MonkeyPatch) -> None:
 
 
 def test_a_file_that_was_mended_is_imported_again(tmp_path: Path) -> None:
-    file = tmp_path / "model.py"
+    file = tmp_path / "policy.py"
     file.write_text("import numpy\nraise OSError('no weights')\n")
     for _ in range(2):
-        with pytest.raises(RegistryError, match=r"OSError: no weights \(model\.py, line 2\)") as caught:
-            WORLD_MODELS.find(f"{file}:Mine")
+        with pytest.raises(RegistryError, match=r"OSError: no weights \(policy\.py, line 2\)") as caught:
+            POLICIES.find(f"{file}:Mine")
         assert isinstance(caught.value.__cause__, OSError)
-    file.write_text(MODEL.format(steps=1))
-    assert WORLD_MODELS.make(f"{file}:Mine").steps == 1
+    file.write_text(POLICY.format(steps=1))
+    assert POLICIES.find(f"{file}:Mine").steps == 1
+
+
+def test_a_models_file_that_was_mended_is_imported_again(tmp_path: Path) -> None:
+    file = tmp_path / "model.py"
+    file.write_text("import numpy\nraise OSError('no weights')\n")
+    with pytest.raises(RegistryError, match=r"OSError: no weights \(model\.py, line 2\)"):
+        WORLD_MODELS.find(f"{file}:Mine")
+    file.write_text(MODEL)
+    assert WORLD_MODELS.make(f"{file}:Mine").accepts.causal
 
 
 @pytest.mark.parametrize("broken", ["class Mine(:\n", "import nothing_of_this_name\n", "1 / 0\n", "x = 1\n"])
 def test_whatever_an_import_raises_is_one_error(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, broken: str) -> None:
-    file = tmp_path / "broken_model.py"
+    file = tmp_path / "broken_file.py"
     file.write_text(broken)
     monkeypatch.syspath_prepend(str(tmp_path))
-    for name in (f"{file}:Mine", "broken_model:Mine"):
-        with pytest.raises(RegistryError, match=r"world model .* cannot be loaded") as caught:
-            WORLD_MODELS.find(name)
+    for name in (f"{file}:Mine", "broken_file:Mine"):
+        with pytest.raises(RegistryError, match=r"policy .* cannot be loaded") as caught:
+            POLICIES.find(name)
         assert caught.value.__cause__ is not None
+    with pytest.raises(RegistryError, match=r"world model .* cannot be loaded"):
+        WORLD_MODELS.find(f"{file}:Mine")
 
 
 def test_an_edited_file_gives_the_new_class_and_an_untouched_one_the_same(tmp_path: Path) -> None:
-    file = tmp_path / "model.py"
-    file.write_text(MODEL.format(steps=1))
-    first = WORLD_MODELS.find(f"{file}:Mine")
-    assert WORLD_MODELS.find(f"{file}:Mine") is first
+    file = tmp_path / "policy.py"
+    file.write_text(POLICY.format(steps=1))
+    first = POLICIES.find(f"{file}:Mine")
+    assert POLICIES.find(f"{file}:Mine") is first
     for steps in (2, 3, 4):
-        file.write_text(MODEL.format(steps=steps))
-        assert WORLD_MODELS.find(f"{file}:Mine").steps == steps
+        file.write_text(POLICY.format(steps=steps))
+        assert POLICIES.find(f"{file}:Mine").steps == steps
     assert first.steps == 1
 
 
 def test_a_file_finds_the_modules_beside_it(tmp_path: Path) -> None:
-    (tmp_path / "helper_beside_the_model.py").write_text("STEPS = 7\n")
-    (tmp_path / "model.py").write_text(MODEL.format(steps="__import__('helper_beside_the_model').STEPS"))
-    assert WORLD_MODELS.find(f"{tmp_path / 'model.py'}:Mine").steps == 7
+    (tmp_path / "helper_beside_the_file.py").write_text("STEPS = 7\n")
+    (tmp_path / "policy.py").write_text(POLICY.format(steps="__import__('helper_beside_the_file').STEPS"))
+    assert POLICIES.find(f"{tmp_path / 'policy.py'}:Mine").steps == 7
 
 
 def test_a_files_module_has_the_same_name_in_every_process(tmp_path: Path) -> None:
-    (tmp_path / "model.py").write_text(MODEL.format(steps=1))
+    (tmp_path / "model.py").write_text(MODEL)
     code = f"import wiw.registry as r; print(r.WORLD_MODELS.find({str(tmp_path / 'model.py')!r} + ':Mine').__module__)"
     names = set()
     for seed in ("1", "2"):
@@ -85,13 +102,13 @@ def test_a_files_module_has_the_same_name_in_every_process(tmp_path: Path) -> No
 
 def test_plugins_are_loaded_by_entry_point(monkeypatch: pytest.MonkeyPatch) -> None:
     points = {
-        "floor": EntryPoint("floor", "wiw.world_models.copy:Copy", "wiw.world_models"),
-        "gone": EntryPoint("gone", "no_such_package:Model", "wiw.world_models"),
+        "rules": EntryPoint("rules", "wiw.policies.heuristic:Heuristic", "wiw.policies"),
+        "gone": EntryPoint("gone", "no_such_package:Policy", "wiw.policies"),
     }
     monkeypatch.setattr(Registry, "_plugins", lambda self: points)
-    assert WORLD_MODELS.make("floor") is not None and "floor" in WORLD_MODELS.names()
+    assert POLICIES.make("rules") is not None and "rules" in POLICIES.names()
     with pytest.raises(RegistryError, match="'gone' cannot be loaded: ModuleNotFoundError"):
-        WORLD_MODELS.find("gone")
+        POLICIES.find("gone")
 
 
 def test_a_class_of_another_kind_is_refused(tmp_path: Path) -> None:

@@ -174,7 +174,10 @@ def test_models_that_need_no_semantics_are_left_alone(two_rooms: str) -> None:
     ],
 )
 def test_labels_reach_the_model_through_any_wrappers(two_rooms: str, reader: str, wrap: Any) -> None:
-    agent, one = wiw.Agent("heuristic", wrap(wiw.world_model(reader)), reviser="matcher"), begin(two_rooms)
+    agent, one = (
+        wiw.Agent("heuristic", wrap(wiw.world_model(reader, isolate=False)), reviser="matcher"),
+        begin(two_rooms),
+    )
     assert decide(agent, one)[0].calls["rows"] > 0
     assert set(np.unique(type(agent.model.unwrapped).seen[-1])) <= set(np.unique(one.semantic()))
 
@@ -189,7 +192,9 @@ def test_labels_that_a_swapped_placebo_brings_along_stay(two_rooms: str, reader:
         def forget(self, key: Key) -> None: ...
 
     agent = wiw.Agent(
-        "heuristic", SwappedPlacebo(Labelled(wiw.world_model(reader), "simulator"), Elsewhere()), reviser="matcher"
+        "heuristic",
+        SwappedPlacebo(Labelled(wiw.world_model(reader, isolate=False), "simulator"), Elsewhere()),
+        reviser="matcher",
     )
     decide(agent, begin(two_rooms))
     assert set(np.unique(type(agent.model.unwrapped).seen[-1])) == {7}
@@ -206,7 +211,7 @@ class Stripes(Semantics):
 
 
 def test_a_source_of_your_own_is_asked_for_all_episodes_at_once(two_rooms: str, reader: str) -> None:
-    agent = wiw.Agent("heuristic", Labelled(wiw.world_model(reader), Stripes), reviser="matcher")
+    agent = wiw.Agent("heuristic", Labelled(wiw.world_model(reader, isolate=False), Stripes), reviser="matcher")
     assert agent.needs == ("depth",)
     assert agent.describe()["semantics"] == {"name": "Stripes"}
     one, other = begin(two_rooms), begin(two_rooms, 1)
@@ -225,7 +230,8 @@ def test_rednet_labels_what_the_model_is_given(two_rooms: str, reader: str, tmp_
     torch.manual_seed(0)
     torch.save({"model_state": RedNet(width=2).state_dict()}, tmp_path / "tiny.pth")
     options = {"weights": str(tmp_path / "tiny.pth"), "device": "cpu", "face": 32}
-    recipe = AgentRecipe("matcher", reader, semantics="rednet", semantics_options=options)
+    own = {"isolate": False}
+    recipe = AgentRecipe("matcher", reader, model_options=own, semantics="rednet", semantics_options=options)
     assert recipe.describe()["semantics_options"]["face"] == 32
     context = RunContext(ImageNav(scenes=two_rooms))
     agent = AgentRecipe.from_json(recipe.to_json()).build(context)

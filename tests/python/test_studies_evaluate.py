@@ -204,7 +204,7 @@ from wiw.studies.evaluate import run_arms
 if __name__ == "__main__":
     out, workers, delay = sys.argv[1], int(sys.argv[2]), float(sys.argv[3])
     arms = {"none": LineAgent(0.5), "warp": LineAgent(0.8)}
-    run_arms(LineTask(delay=delay), arms, 8, out=out, workers=workers, progress=False, resume=True)
+    run_arms(LineTask(delay=delay), arms, 8, out=out, workers=workers, progress=False, resume=True, salt="")
 """
 
 

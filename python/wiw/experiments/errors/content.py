@@ -140,8 +140,8 @@ class Invented(ContentDegradation):
         chosen = _choose(things, generator, self.dose)
         places = _draw_floor(fork, len(things.ids), generator)
         copies = chosen.poses.copy()
-        index = np.searchsorted(things.ids, chosen.ids)
-        copies[:, 0, 3], copies[:, 2, 3] = places[index, 0], places[index, 2]
+        way = places[np.searchsorted(things.ids, chosen.ids)] - chosen.middles
+        copies[:, [0, 2], 3] += way[:, [0, 2]]  # a file's pose may be anywhere, as one for all of them
         moved = MovedRenderer(fork.renderer, chosen.ids, copies, chosen.poses)
         return DrawnFork(ComposedRenderer(fork.renderer, moved, chosen.ids), fork.camera_poses_after)
 
@@ -203,6 +203,8 @@ class Instances:
     """uint32 [N], ascending."""
     poses: NDArray[np.float32]
     """float32 [N, 4, 4]: T_world_instance."""
+    middles: NDArray[np.float32]
+    """float32 [N, 3]: middle of the bounds in the world."""
     drop: float
     """Metres down that take an instance out of every view."""
 
@@ -228,7 +230,8 @@ def list_barriers(scene: Any) -> Instances:
 
 
 def _list_instances(scene: Any, words: str, belongs: Any) -> Instances:
-    found = [each for each in scene.instances if each["category"] and belongs(each["category"])]
+    drawn = [each for each in scene.instances if each["triangle_count"]]
+    found = [each for each in drawn if each["category"] and belongs(each["category"])]
     if not found:
         raise ArgumentError(
             f"scene {scene.name} has no {words} that could be drawn otherwise; expected a scene whose instances have "
@@ -236,19 +239,15 @@ def _list_instances(scene: Any, words: str, belongs: Any) -> Instances:
         )
     low, high = scene.bounds
     ids = np.array([each["id"] for each in found], np.uint32)
-    return Instances(ids, np.stack([each["T_world_instance"] for each in found]), float(high[1] - low[1]) + 1.0)
+    middles = np.stack([each["bounds"].mean(axis=0) for each in found])
+    poses = np.stack([each["T_world_instance"] for each in found])
+    return Instances(ids, poses, middles, float(high[1] - low[1]) + 1.0)
 
 
 def _choose(instances: Instances, generator: np.random.Generator, share: float) -> Instances:
     """Return the instances that are drawn; those of a smaller share are among those of a larger one."""
     drawn = generator.random(len(instances.ids)) < share
-    return Instances(instances.ids[drawn], instances.poses[drawn], instances.drop)
-
-
-def _choose_names(bench: Any, generator: np.random.Generator, share: float) -> list[str]:
-    """Return the things on a table that are drawn, likewise."""
-    drawn = generator.random(len(bench.things)) < share
-    return [name for name, one in zip(bench.things, drawn, strict=True) if one]
+    return Instances(instances.ids[drawn], instances.poses[drawn], instances.middles[drawn], instances.drop)
 
 
 def _hide(fork: WorldFork, instances: Instances) -> DrawnFork:
