@@ -191,11 +191,8 @@ def test_labels_that_a_swapped_placebo_brings_along_stay(two_rooms: str, reader:
 
         def forget(self, key: Key) -> None: ...
 
-    agent = wiw.Agent(
-        "heuristic",
-        SwappedPlacebo(Labelled(wiw.world_model(reader, isolate=False), "simulator"), Elsewhere()),
-        reviser="matcher",
-    )
+    model = Labelled(wiw.world_model(reader, isolate=False), "simulator")
+    agent = wiw.Agent("heuristic", SwappedPlacebo(model, Elsewhere()), reviser="matcher")
     decide(agent, begin(two_rooms))
     assert set(np.unique(type(agent.model.unwrapped).seen[-1])) == {7}
 
