@@ -17,7 +17,7 @@ SIZES = {  # names of the cell that is tagged "parameters", and what is enough t
     "04_answer_questions": {"apartments": 4, "questions": 2, "actions": 15},
 }
 
-DEAR = ("02_compare_world_models", "04_answer_questions")
+DEAR = ("02_compare_world_models", "03_plug_in_your_model", "04_answer_questions")
 """Run nightly: what they call is tested elsewhere, and each takes most of a minute."""
 
 

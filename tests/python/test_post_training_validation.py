@@ -177,8 +177,10 @@ def test_a_training_that_is_stopped_while_it_validates_ends_with_the_same_bytes(
         return stock(self, *asked)
 
     monkeypatch.setattr(TrainingSampler, "__call__", stop)
+    handler = signal.signal(signal.SIGINT, signal.default_int_handler)  # a job in a shell's background ignores it
     with pytest.raises(KeyboardInterrupt):
         train(tmp_path / "stopped")
+    signal.signal(signal.SIGINT, handler)
     monkeypatch.undo()
     assert torch.load(tmp_path / "stopped.checkpoint", weights_only=True)["step"] == 4
     train(tmp_path / "stopped")

@@ -381,7 +381,7 @@ def check_balance(episodes: list[Episode]) -> None:
     assert yes_no.count("yes") * 2 == len(yes_no)
 
 
-@pytest.mark.slow
+@pytest.mark.nightly
 def test_no_text_gives_its_answer_away_in_six_apartments() -> None:
     """In a block of four apartments and in a smaller one; all are homes that other tests bake as well."""
     specs = [*scenes.resolve("apartments:val:4"), *scenes.resolve("apartments:train:2")]
