@@ -297,7 +297,8 @@ def test_a_row_whose_first_asker_waited_too_short_is_asked_for_again():
     with remote(model) as (client, server), ThreadPoolExecutor(2) as pool:
         busy = pool.submit(ask, client, 4, 90)
         wait_for(lambda: model.rows)
-        with pytest.raises(RemoteError, match="busy or hung"), answer_deadline(0.3):
+        # whichever of the two sees first that the time is over
+        with pytest.raises(RemoteError, match=r"busy or hung|the queue is long"), answer_deadline(0.3):
             ask(client, 2)
         again = pool.submit(ask, client, 2)
         wait_for(lambda: len(server.queue) == 2)
