@@ -121,7 +121,6 @@ def test_what_makes_no_sense_is_left_out_by_name() -> None:
     assert [dose for _, dose in ErrorSettings(doses=2, kinds=("lag",)).list_arms("ar").values()] == [2.0, 4.0]
 
 
-@pytest.mark.nightly
 def test_a_study_goes_on_where_it_stopped(two_rooms: str, tmp_path: Path, capsys) -> None:
     settings = ErrorSettings(
         tasks=("imagenav",), kinds=("blur", "ignored"), doses=1, episodes=2, scenes=two_rooms, size=(64, 128)

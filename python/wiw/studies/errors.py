@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What kind of error costs success? The oracle's true futures are made worse by known doses, and success is measured.
+"""Study of which kind of error costs success: true futures are made worse by known doses, and success is measured.
 
 The paper finds that success follows controllability rather than visual quality, over a dozen models that differ in
 both and in everything else. Here one thing is changed at a time, in futures that are true otherwise, so that a loss of
@@ -18,11 +18,13 @@ from typing import Any
 from wiw.analysis.errors import ErrorTable, summarise_errors
 from wiw.errors import ArgumentError
 from wiw.experiments.errors import ERRORS
+from wiw.loop import keys
 from wiw.metrics import Lpips
 from wiw.registry import task_class
 from wiw.runs.recipes import ERROR, AgentRecipe, TaskRecipe
 from wiw.runs.rows import to_json
 from wiw.runs.shards import Shard
+from wiw.runs.store import RunStore
 from wiw.studies.evaluate import evaluate
 from wiw.studies.run_log import load_run
 from wiw.types import PRIMITIVES
@@ -39,7 +41,7 @@ Watch = Callable[[str, int, int, str], None]
 
 @dataclass(frozen=True, kw_only=True)
 class ErrorSettings:
-    """What a user of the study chooses.
+    """Settings that a user of the study chooses.
 
     Raises:
         ArgumentError: a number out of range, or an unknown task or kind of error.
@@ -49,12 +51,12 @@ class ErrorSettings:
     kinds: tuple[str, ...] = tuple(ERRORS)
     """Kinds of errors; those that make no sense in a task are left out there, and named."""
     doses: int = 3
-    """How many doses of each kind, the largest ones of `FutureError.doses`."""
+    """Doses of each kind, the largest ones of `FutureError.doses`."""
     episodes: int = 100
-    """Of each task."""
+    """Episodes of each task."""
     seed: int = 0
     scenes: str | None = None
-    """Of tasks in which an agent walks; the task's own if None."""
+    """Scenes of tasks in which an agent walks; the task's own if None."""
     per_scene: int = 2
     """Episodes in a scene, of tasks in which an agent walks."""
     policy: str | None = None
@@ -180,7 +182,7 @@ def _run_task(
     """Run all arms of a task, part by part; return the folders of the runs."""
     recipe, agent = _make_recipes(task, settings)
     arms = [FLOOR, CEILING, *_order_arms(settings.list_arms(task))]
-    count = -(-settings.episodes // BLOCK)
+    count, salt = -(-settings.episodes // BLOCK), _find_salt(folder)
     done = []
     for number in range(1, count + 1):
         shard = Shard(number, count)
@@ -192,6 +194,7 @@ def _run_task(
             out=folder / shard.folder,
             resume=True,
             shard=str(shard),
+            salt=salt,
             workers=workers,
             seed=settings.seed,
             keep_images=0,
@@ -204,6 +207,15 @@ def _run_task(
         done.append(folder / shard.folder)
         watch(task, number, count, f"{shard.select(settings.episodes).stop}/{settings.episodes} episodes")
     return done
+
+
+def _find_salt(folder: Path) -> str:
+    """Return the salt that the parts of a run have in common: that of the first one, or a new one."""
+    begun = sorted(path.parent for path in folder.glob("*/run.sqlite"))
+    if not begun:
+        return keys.draw_salt()
+    with RunStore.read(begun[0]) as store:
+        return store.salt
 
 
 def _order_arms(arms: Mapping[str, tuple[str, float]]) -> list[str]:
