@@ -5,7 +5,7 @@ from __future__ import annotations
 
 import os
 import shutil
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager, suppress
 from pathlib import Path
 
@@ -26,6 +26,18 @@ def atomic_file(path: Path) -> Iterator[Path]:
         yield draft
         _sync(draft)
         draft.replace(path)
+
+
+def write_files(folder: Path, contents: Mapping[str, str | bytes]) -> list[Path]:
+    """Write files into a folder, each of them atomically, text as UTF-8; return their paths in the order of `contents`.
+
+    Raises:
+        FileError: one of them cannot be written.
+    """
+    for name, content in contents.items():
+        with atomic_file(folder / name) as draft:
+            draft.write_bytes(content.encode() if isinstance(content, str) else content)
+    return [folder / name for name in contents]
 
 
 @contextmanager

@@ -9,7 +9,7 @@ from typing import Any
 
 from wiw.analysis.data_scaling import ScalingTable
 from wiw.analysis.summary import show_estimate
-from wiw.files import atomic_file
+from wiw.files import write_files
 from wiw.report import plots
 from wiw.report.data_scaling_tables import (
     ABOUT,
@@ -37,16 +37,13 @@ def write_scaling(table: ScalingTable, plan: Mapping[str, Any], numbers: str, fo
     Raises:
         FileError: it cannot be written.
     """
-    contents = {
-        "data-scaling.html": render_scaling(table, plan).encode(),
+    contents: dict[str, str | bytes] = {
+        "data-scaling.html": render_scaling(table, plan),
         "data-scaling.svg": plots.draw_scaling(table, "svg"),
         "data-scaling.png": plots.draw_scaling(table, "png"),
-        "data-scaling.json": numbers.encode(),
+        "data-scaling.json": numbers,
     }
-    for name, content in contents.items():
-        with atomic_file(folder / name) as draft:
-            draft.write_bytes(content)
-    return [folder / name for name in contents]
+    return write_files(folder, contents)
 
 
 def render_scaling(table: ScalingTable, plan: Mapping[str, Any]) -> str:

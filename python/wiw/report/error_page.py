@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import Any
 
 from wiw.analysis.errors import ErrorTable
-from wiw.files import atomic_file
+from wiw.files import write_files
 from wiw.report import plots
 from wiw.report.error_tables import (
     ABOUT,
@@ -38,16 +38,13 @@ def write_errors(tables: Sequence[ErrorTable], settings: Mapping[str, Any], numb
     Raises:
         FileError: it cannot be written.
     """
-    contents = {
-        "errors.html": render_errors(tables, settings).encode(),
+    contents: dict[str, str | bytes] = {
+        "errors.html": render_errors(tables, settings),
         "errors.svg": plots.draw_errors(tables, "svg"),
         "errors.png": plots.draw_errors(tables, "png"),
-        "errors.json": numbers.encode(),
+        "errors.json": numbers,
     }
-    for name, content in contents.items():
-        with atomic_file(folder / name) as draft:
-            draft.write_bytes(content)
-    return [folder / name for name in contents]
+    return write_files(folder, contents)
 
 
 def render_errors(tables: Sequence[ErrorTable], settings: Mapping[str, Any]) -> str:

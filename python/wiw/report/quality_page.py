@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import Any
 
 from wiw.analysis.quality import QualityTable
-from wiw.files import atomic_file
+from wiw.files import write_files
 from wiw.report import plots
 from wiw.report.quality_tables import ABOUT, RANK_TITLES, arm_rows, explain, label_measure, show_rank
 from wiw.report.templating import environment
@@ -29,16 +29,13 @@ def write_quality(table: QualityTable, pictures: Mapping[str, Sequence[Any]], nu
         FileError: it cannot be written.
     """
     drawn = list_drawn_measures(table)
-    contents = {
-        "quality.html": render_quality(table, pictures).encode(),
+    contents: dict[str, str | bytes] = {
+        "quality.html": render_quality(table, pictures),
         "quality.svg": plots.draw_success_by_measures(table, drawn, "svg"),
         "quality.png": plots.draw_success_by_measures(table, drawn, "png"),
-        "quality.json": numbers.encode(),
+        "quality.json": numbers,
     }
-    for name, content in contents.items():
-        with atomic_file(folder / name) as draft:
-            draft.write_bytes(content)
-    return [folder / name for name in contents]
+    return write_files(folder, contents)
 
 
 def render_quality(table: QualityTable, pictures: Mapping[str, Sequence[Any]]) -> str:

@@ -14,7 +14,7 @@ from markupsafe import Markup
 from wiw.analysis.quality import QualityTable
 from wiw.analysis.statistics import Difference
 from wiw.analysis.summary import Group
-from wiw.files import atomic_file
+from wiw.files import write_files
 from wiw.report import plots
 from wiw.report.page import list_table_values
 from wiw.report.quality_page import list_drawn_measures
@@ -53,10 +53,7 @@ def write_study(plan: Any, parts: Sequence[Any], numbers: str, folder: Path) -> 
         for title, _, drawing in own:
             name = re.sub(r"\W+", "-", f"{part.run.name} {title}".lower()).strip("-")
             contents[f"{name}.svg"] = str(drawing)
-    for name, content in contents.items():
-        with atomic_file(folder / name) as draft:
-            draft.write_text(content, encoding="utf-8")
-    return [folder / name for name in contents]
+    return write_files(folder, contents)
 
 
 def render_study(plan: Any, parts: Sequence[Any], figures: Sequence[Figures]) -> str:
