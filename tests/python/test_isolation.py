@@ -26,9 +26,10 @@ from wiw.isolation.failures import EndedError, ExitError, LateError, RaisedError
 from wiw.isolation.models import IsolatedModel
 from wiw.loop import attempts
 from wiw.loop.attempts import Attempted, make_model
+from wiw.policies.base import Situation
 from wiw.runs.recipes import AgentRecipe, TaskRecipe
 from wiw.studies.evaluate import evaluate
-from wiw.types import Conditioning, Control
+from wiw.types import Conditioning, Control, Goal, Key, Observation
 
 BAD = f"{Path(__file__).with_name('bad_models.py')}:Bad"
 PEEPING = BAD.replace(":Bad", ":Peeping")
@@ -216,12 +217,13 @@ from wiw.types import Proposal
 
 class Own(wiw.Policy):
     def __init__(self, fatal: int = -1) -> None:
-        self.fatal = fatal
+        self.fatal, self.looks = fatal, 0
 
     def begin(self, goal, key):
         return Counter()
 
     def observe(self, situations):
+        self.looks += len(situations)
         for each in situations:
             each.memory["looks"] += 1
 
@@ -240,6 +242,10 @@ class Own(wiw.Policy):
 
     def describe(self):
         return {"policy": "Own"}
+
+    @property
+    def spent(self):
+        return {"looks": self.looks}
 """
 
 
@@ -265,6 +271,29 @@ def test_a_policy_decides_in_its_process_as_in_ours_and_cannot_take_the_run_with
     assert "its process ended with exit code 3" in log.episodes[2]["error"]
     with pytest.raises(RegistryError, match="expected a policy of your own"):
         wiw.policy("isolated:matcher")
+
+
+def test_a_policy_s_new_process_takes_no_memory_for_one_of_the_old_one_s(tmp_path) -> None:
+    (tmp_path / "own.py").write_text(POLICY)
+    policy, key, goal = wiw.policy(f"isolated:{tmp_path / 'own.py'}:Own"), Key(0, 0), Goal("imagenav")
+
+    def look(memory) -> str:
+        blank = np.zeros((8, 16, 3), np.uint8)
+        situation = Situation(Observation(blank, blank, np.zeros(3)), goal, key, memory)
+        policy.observe([situation])
+        return policy.propose([situation], 1, 3)[0][0].note
+
+    first, second = policy.begin(goal, key), policy.begin(goal, key)
+    assert [look(first), look(first), look(second)] == ["look 1, 0 done", "look 2, 0 done", "look 1, 0 done"]
+    policy.close()
+    new = policy.begin(goal, key)
+    with pytest.raises(RaisedError, match="process has ended since"):
+        look(second)
+    del first, second
+    gc.collect()
+    assert [look(new), look(new)] == ["look 1, 0 done", "look 2, 0 done"]
+    assert policy.spent == {"looks": 5}
+    policy.close()
 
 
 FATAL_MODEL = """

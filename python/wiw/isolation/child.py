@@ -30,13 +30,13 @@ FIRST_TO_GO = 500
 
 
 class Host:
-    """What functions of a call work on.
+    """State that the functions of a call work on.
 
     Attributes:
         thing: class, factory or object that was loaded.
         make: makes an instance of it.
         made: that instance.
-        memories: of its live episodes, by number, and their `count`, where it is a policy.
+        memories: of its live episodes, by number, where it is a policy.
         answer: memory for arrays of the answer, uint8 [bytes], during a call that asks for it.
     """
 
@@ -45,7 +45,6 @@ class Host:
         self.make: Any = None
         self.made: Any = None
         self.memories: dict[int, Any] = {}
-        self.count = 0
         self.answer: NDArray[np.uint8] = np.empty(0, np.uint8)
 
 

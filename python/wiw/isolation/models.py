@@ -9,7 +9,6 @@ from __future__ import annotations
 
 import json
 import math
-from collections import Counter
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from contextvars import ContextVar
@@ -19,11 +18,10 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from wiw.errors import ArgumentError, ConstructionError, RegistryError
+from wiw.errors import ArgumentError, RegistryError
 from wiw.isolation.child import Host
-from wiw.isolation.failures import EndedError, ExitError, LateError, RaisedError
-from wiw.isolation.process import ChildProcess
-from wiw.isolation.source import Isolated, Source, build_signature, read_file_state, require_task, tell_class
+from wiw.isolation.failures import ExitError, RaisedError
+from wiw.isolation.source import Isolated, Source, build_signature, read_file_state, tell_class
 from wiw.json_text import parse_json
 from wiw.registry import WORLD_MODELS
 from wiw.types import Conditioning, Control
@@ -76,7 +74,7 @@ def _make_class(name: str, state: tuple[str, int, int] | None) -> type[IsolatedM
     return type(told["name"], (IsolatedModel,), attributes)
 
 
-class IsolatedModel(WorldModel, Isolated):
+class IsolatedModel(Isolated, WorldModel):
     """Stands for a world model in a process of its own.
 
     Args:
@@ -95,10 +93,9 @@ class IsolatedModel(WorldModel, Isolated):
         return super().__new__(cls) if isolate else WORLD_MODELS.make_here(cls.source.name, **options)
 
     def __init__(self, isolate: bool = True, memory_gb: float | None = None, **options: Any) -> None:
-        self._memory_gb, self._options = memory_gb, options
+        super().__init__(memory_gb)
+        self._options = options
         self._patience, self._failures = _PATIENCE.get(), 0
-        self._spent, self._spent_before = Counter[str](), Counter[str]()
-        self._process: ChildProcess | None = None
         self._accepts = parse_declaration(self._begin())
         if "simulator" in self._accepts.needs:
             raise ArgumentError(
@@ -113,20 +110,6 @@ class IsolatedModel(WorldModel, Isolated):
     def accepts(self) -> Accepts:  # type: ignore[override]
         """The model's declaration."""
         return self._accepts
-
-    @property
-    def spent(self) -> Mapping[str, float]:
-        """Resources that the model has used up so far, in all of its processes."""
-        return self._spent_before + self._spent
-
-    @classmethod
-    def require(cls, task: Mapping[str, Any]) -> None:
-        """Ask the class whether it is made for a task.
-
-        Raises:
-            ArgumentError: it is not.
-        """
-        cls.source.ask(require_task, dict(task))
 
     def describe(self) -> dict[str, Any]:
         """Return what the model says of itself."""
@@ -168,38 +151,12 @@ class IsolatedModel(WorldModel, Isolated):
                 process.kill()
             raise
         self._failures = 0
-        self._spent = Counter({str(name): float(value) for name, value in spent.items()})
+        self._count_spent(spent)
         return answer.reshape(shape)
-
-    def close(self) -> None:
-        """End the process; the next call starts another one."""
-        if self._process is not None:
-            self._process.kill()
-
-    def _find_process(self) -> ChildProcess:
-        if self._process is None or not self._process.alive:
-            self._begin()
-        assert self._process is not None
-        return self._process
 
     def _begin(self) -> str:
         """Make the model in a process that has none; return its declaration."""
-        self._spent_before += self._spent
-        self._spent = Counter()
-        process, name = self.source.take_process(self._memory_gb), self.source.name
-        try:
-            made: str = process.call(make_model, self._options, self._patience, seconds=self._patience)[0]
-        except LateError as error:
-            raise ConstructionError(
-                f"world model '{name}' cannot be made: its constructor did not return within {self._patience:g} s "
-                "(deadline). Does it wait for a download, a lock, a server or a prompt? If it is only slow, give a "
-                "longer deadline",
-                "deadline",
-            ) from error
-        except (EndedError, ExitError) as error:
-            raise ConstructionError(f"world model '{name}' cannot be made: {error}", error.kind) from None
-        self._process = process
-        return made
+        return str(self._make(make_model, self._options, self._patience, seconds=self._patience))
 
 
 class _Declared:

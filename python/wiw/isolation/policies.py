@@ -6,6 +6,7 @@ The memories of episodes stay in that process; the loop holds handles of them.
 
 from __future__ import annotations
 
+import itertools
 import json
 import weakref
 from collections.abc import Mapping, Sequence
@@ -16,11 +17,9 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from wiw.errors import ConstructionError, ContractError, RegistryError
+from wiw.errors import ContractError, RegistryError
 from wiw.isolation.child import Host
-from wiw.isolation.failures import EndedError, ExitError, LateError
-from wiw.isolation.process import ChildProcess
-from wiw.isolation.source import Isolated, Source, build_signature, read_file_state, require_task, tell_class
+from wiw.isolation.source import Isolated, Source, build_signature, read_file_state, tell_class
 from wiw.json_text import parse_json
 from wiw.policies.base import FrameSpec, Policy, Situation
 from wiw.registry import POLICIES
@@ -64,7 +63,7 @@ class _MemoryHandle:
         self.number = number
 
 
-class IsolatedPolicy(Policy, Isolated):
+class IsolatedPolicy(Isolated, Policy):
     """Stands for a policy in a process of its own.
 
     A call that fails or is late loses all memories: its episodes end with errors, or begin anew.
@@ -79,23 +78,15 @@ class IsolatedPolicy(Policy, Isolated):
     """
 
     def __init__(self, memory_gb: float | None = None, deadline: float = 600.0, **options: Any) -> None:
-        self._memory_gb, self._deadline, self._options = memory_gb, deadline, options
+        super().__init__(memory_gb)
+        self._deadline, self._options = deadline, options
         self._forgotten: list[int] = []
-        self._spent: dict[str, float] = {}
-        self._process = self._begin()
+        self._numbers = itertools.count()  # of memories, of all processes: none is taken for one of another's
+        self._begin()
 
     def __reduce__(self) -> Any:
         options = {"memory_gb": self._memory_gb, "deadline": self._deadline, **self._options}
         return _make_again, (self.source.name, options)
-
-    @classmethod
-    def require(cls, task: Mapping[str, Any]) -> None:
-        """Ask the class whether it is made for a task.
-
-        Raises:
-            ArgumentError: it is not.
-        """
-        cls.source.ask(require_task, dict(task))
 
     @property
     def can_revise(self) -> bool:
@@ -107,11 +98,6 @@ class IsolatedPolicy(Policy, Isolated):
         """Whether the policy can propose from an imagined place."""
         return bool(self._told["can_extend"])
 
-    @property
-    def spent(self) -> Mapping[str, float]:
-        """Resources used so far."""
-        return self._spent
-
     def describe(self) -> dict[str, Any]:
         """Return what the policy says of itself."""
         described: dict[str, Any] = parse_json(self._told["described"])
@@ -119,7 +105,8 @@ class IsolatedPolicy(Policy, Isolated):
 
     def begin(self, goal: Goal, key: Key) -> Any:
         """Begin an episode there; return a handle of its memory."""
-        handle = _MemoryHandle(int(self._call(begin_episode, goal, key)))
+        handle = _MemoryHandle(next(self._numbers))
+        self._call(begin_episode, handle.number, goal, key)
         weakref.finalize(handle, self._forgotten.append, handle.number).atexit = False
         return handle
 
@@ -178,24 +165,17 @@ class IsolatedPolicy(Policy, Isolated):
             Exchange(**{**each, "said": tuple(each["said"])}) for each in json.loads(self._call(list_exchanges, key))
         )
 
-    def _begin(self) -> ChildProcess:
-        """Make the policy in a process that has none; return it."""
-        process, name = self.source.take_process(self._memory_gb), self.source.name
-        try:
-            told = process.call(make_policy, self._options, seconds=self._deadline)[0]
-        except (EndedError, ExitError, LateError) as error:
-            raise ConstructionError(f"policy '{name}' cannot be made: {error}", error.kind) from None
-        self._told: dict[str, Any] = told
-        for attribute, value in _read_declaration(told).items():
+    def _begin(self) -> None:
+        """Make the policy in a process that has none."""
+        self._told: dict[str, Any] = self._make(make_policy, self._options, seconds=self._deadline)
+        for attribute, value in _read_declaration(self._told).items():
             setattr(self, attribute, value)
-        return process
 
     def _call(self, function: Any, *arguments: Any) -> Any:
-        if not self._process.alive:
-            self._process = self._begin()
+        process = self._find_process()
         forgotten, self._forgotten[:] = list(self._forgotten), []
-        value, spent = self._process.call(run_policy, forgotten, function, *arguments, seconds=self._deadline)[0]
-        self._spent = {str(name): float(amount) for name, amount in spent.items()}
+        value, spent = process.call(run_policy, forgotten, function, *arguments, seconds=self._deadline)[0]
+        self._count_spent(spent)
         return value
 
 
@@ -257,7 +237,7 @@ def _declare(thing: Any) -> dict[str, Any]:
 
 def make_policy(host: Host, options: Mapping[str, Any]) -> dict[str, Any]:
     """Make the policy; return what it declares and has."""
-    host.made, host.memories, host.count = host.make(**options), {}, 0
+    host.made, host.memories = host.make(**options), {}
     made, kind = host.made, type(host.made)
     return {
         **_declare(made),
@@ -278,11 +258,9 @@ def run_policy(host: Host, forgotten: Sequence[int], function: Any, *arguments: 
     return value, {name: float(amount) for name, amount in host.made.spent.items()}
 
 
-def begin_episode(host: Host, goal: Goal, key: Key) -> int:
-    """Begin an episode; return the number of its memory."""
-    host.count += 1
-    host.memories[host.count] = host.made.begin(goal, key)
-    return host.count
+def begin_episode(host: Host, number: int, goal: Goal, key: Key) -> None:
+    """Begin an episode, whose memory has a number."""
+    host.memories[number] = host.made.begin(goal, key)
 
 
 def observe(host: Host, situations: Sequence[Situation]) -> None:

@@ -5,14 +5,15 @@ from __future__ import annotations
 
 import inspect
 import weakref
+from collections import Counter
 from collections.abc import Callable, Mapping, Sequence
 from functools import partial
 from pathlib import Path
-from typing import Any
+from typing import Any, ClassVar
 
-from wiw.errors import InfrastructureError, RegistryError
+from wiw.errors import ConstructionError, InfrastructureError, RegistryError
 from wiw.isolation.child import Host
-from wiw.isolation.failures import EndedError, ExitError
+from wiw.isolation.failures import EndedError, ExitError, LateError
 from wiw.isolation.process import ChildProcess
 
 _SOURCES: weakref.WeakSet[Source] = weakref.WeakSet()
@@ -79,9 +80,75 @@ class Source:
 
 
 class Isolated:
-    """Base of what stands for a part in a process of its own."""
+    """Base of what stands for a part in a process of its own; where that has ended, another one is begun.
 
-    source: Source
+    Args:
+        memory_gb: most gigabytes of memory that a process may take; three quarters of the machine's if None.
+    """
+
+    source: ClassVar[Source]
+
+    def __init__(self, memory_gb: float | None) -> None:
+        self._memory_gb = memory_gb
+        self._process: ChildProcess | None = None
+        self._spent, self._spent_before = Counter[str](), Counter[str]()
+
+    @classmethod
+    def require(cls, task: Mapping[str, Any]) -> None:
+        """Ask the class whether it is made for a task.
+
+        Raises:
+            ArgumentError: it is not.
+        """
+        cls.source.ask(_require_task, dict(task))
+
+    @property
+    def spent(self) -> Mapping[str, float]:
+        """Resources that the part has used up so far, in all of its processes."""
+        return self._spent_before + self._spent
+
+    def close(self) -> None:
+        """End the process; the next call starts another one."""
+        if self._process is not None:
+            self._process.kill()
+
+    def _find_process(self) -> ChildProcess:
+        """Return the process in which the part is, made anew where that has ended."""
+        if self._process is None or not self._process.alive:
+            self._begin()
+        assert self._process is not None
+        return self._process
+
+    def _begin(self) -> Any:
+        """Make the part in a process, by `_make`."""
+        raise NotImplementedError
+
+    def _make(self, function: Callable[..., Any], *arguments: Any, seconds: float) -> Any:
+        """Call a function that makes the part in a process that has none; return what it tells of it.
+
+        Raises:
+            ConstructionError: the constructor raised, did not return in time, or ended its process.
+        """
+        self._spent_before += self._spent
+        self._spent = Counter()
+        process = self.source.take_process(self._memory_gb)
+        cannot = f"{self.source.kind} '{self.source.name}' cannot be made"
+        try:
+            told = process.call(function, *arguments, seconds=seconds)[0]
+        except LateError as error:
+            raise ConstructionError(
+                f"{cannot}: its constructor did not return within {seconds:g} s (deadline). Does it wait for a "
+                "download, a lock, a server or a prompt? If it is only slow, give a longer deadline",
+                "deadline",
+            ) from error
+        except (EndedError, ExitError) as error:
+            raise ConstructionError(f"{cannot}: {error}", error.kind) from None
+        self._process = process
+        return told
+
+    def _count_spent(self, spent: Mapping[str, Any]) -> None:
+        """Note what the part has used up in its present process."""
+        self._spent = Counter({str(name): float(amount) for name, amount in spent.items()})
 
 
 def read_file_state(name: str) -> tuple[str, int, int] | None:
@@ -150,7 +217,7 @@ class _Hidden:
         return self._text
 
 
-def require_task(host: Host, task: Mapping[str, Any]) -> None:
+def _require_task(host: Host, task: Mapping[str, Any]) -> None:
     """Ask the class whether it is made for a task, in its process; a factory takes any."""
     thing: Any = host.thing
     if isinstance(thing, type) and hasattr(thing, "require"):
