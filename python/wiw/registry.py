@@ -42,12 +42,12 @@ class Registry:
     base: str = ""
     """`module:class` that things of this kind derive from, if they have to."""
     registered: dict[str, Any] = field(default_factory=dict)
-    """What programs have added under names of their own (`register`)."""
+    """Things that programs have added under names of their own (`register`)."""
     door: str = ""
     """`module:function` that returns what stands for a part of somebody else's, given its name, so that its code is
     imported and run in a process of its own; empty where such parts are run in this one."""
     prefix: str = ""
-    """What names begin with that are to go through the door; empty where those of all parts of somebody else's do."""
+    """Beginning of the names that go through the door; empty where those of all parts of somebody else's do."""
 
     def names(self) -> list[str]:
         """Return all registered names, built-in ones first."""
@@ -260,9 +260,9 @@ WORLD_MODELS = Registry(
     door="wiw.isolation.models:find_isolated_model",
 )
 ISOLATED = "isolated:"
-"""What a policy's name begins with that is to run in a process of its own."""
+"""Beginning of the name of a policy that is to run in a process of its own."""
 FUNCTION = "wiw.world_models.function:Function"
-"""What makes a world model of a function."""
+"""Class that makes a world model of a function."""
 POLICIES = Registry(
     "policy",
     "wiw.policies",

@@ -28,7 +28,7 @@ KEPT: list[object] = []
 
 
 class Leaving(BaseException):
-    """What a library may use to leave all handlers of `Exception` behind."""
+    """Exception of a library that passes all handlers of `Exception`."""
 
 
 def imagine(observations, controls):

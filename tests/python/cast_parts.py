@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What textured parts look like, by trimesh's Embree and NumPy alone: an oracle for readers and renderers."""
+"""Looks of textured parts, by trimesh's Embree and NumPy alone: an oracle for readers and renderers."""
 
 from __future__ import annotations
 

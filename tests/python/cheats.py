@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What a part under test could do to know more than it should; `test_firewall.py` sees to it that it does not pay."""
+"""Parts under test that try to learn more than they should; `test_firewall.py` sees to it that it does not pay."""
 
 from __future__ import annotations
 

@@ -224,7 +224,7 @@ def test_plans_go_round_corners_and_fill_the_horizon() -> None:
 
 @pytest.mark.parametrize("horizon", [1, 3])
 def test_routes_stay_on_the_cropped_floor(horizon: int) -> None:
-    """What the search sees ends near the agent; a wall there must not lead it over the edge."""
+    """The map of the search ends near the agent; a wall there must not lead it over the edge."""
     grid = known_floor((0.3, 0.5, -3.0, 3.0), (-3.0, 0.4, 0.4, 0.6))
     way_map, far = WayMap(grid), to_cells(np.array([[3.9, 3.9], [-3.9, -3.9], [2.1, 0.1]]))
     ways = way_map.measure_ways(np.zeros((1, 2)))

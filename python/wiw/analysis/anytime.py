@@ -17,7 +17,7 @@ from numpy.typing import ArrayLike, NDArray
 from wiw.analysis.intervals import Array, Interval
 
 SHARES = np.arange(1, 32) / 32
-"""Of the capital that a bet may lose at most, on either side."""
+"""Greatest shares of the capital that a bet may lose, on either side."""
 MEANS = 500
 """Steps of the grid on which an interval's ends are sought."""
 

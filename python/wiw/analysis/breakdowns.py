@@ -15,7 +15,7 @@ from wiw.types import Episode
 Done = Mapping[str, Mapping[int, Mapping[str, Any]]]
 """By arm, scored episodes by index with "scene", "metrics", and "task" where there are kinds."""
 PRIMITIVES, DECISIONS = "primitives", "decisions"
-"""What cuts of an anytime curve count."""
+"""Units in which an anytime curve is cut."""
 MOST_CUTS = 10
 """Most cuts of an anytime curve over decisions."""
 BOTH, ONE, NEITHER = "both right", "one right", "neither right"
@@ -47,7 +47,7 @@ class Breakdown:
     shown: frozenset[tuple[str, str]] = frozenset()
     """Row and column of the differences that the test, adjusted for all of the table, finds."""
     cut_unit: str = ""
-    """What cuts count, "primitives" or "decisions"; empty where keys are no cuts."""
+    """Unit of the cuts, "primitives" or "decisions"; empty where keys are no cuts."""
 
     @property
     def keys(self) -> tuple[str, ...]:

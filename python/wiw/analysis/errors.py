@@ -58,7 +58,7 @@ class ErrorLine:
 
 @dataclass(frozen=True)
 class Cost:
-    """What a family of errors costs for each `STEP` of a measure."""
+    """The cost of a family of errors for each `STEP` of a measure."""
 
     family: str
     measure: str
@@ -86,7 +86,7 @@ class ErrorTable:
     task: str
     policy: str
     label: str
-    """Of the outcome: "SR" or "Score"."""
+    """Name of the outcome: "SR" or "Score"."""
     episodes: int
     """Scored in none, the oracle and every arm that counts among the costs."""
     scenes: int

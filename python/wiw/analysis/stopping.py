@@ -33,7 +33,7 @@ class Look:
     """Most episodes that the run may have per arm."""
     text: str
     """E.g. "oracle-none +31.2 [3.0, 60.1] over 12 scenes"."""
-    reached: bool
+    is_enough: bool
     """Whether the run stops."""
 
     def __str__(self) -> str:
@@ -46,7 +46,7 @@ class StopRule:
 
     text: str
     targets: tuple[tuple[str, ...], ...]
-    """What it looks at: an arm, or an arm and what it is compared with."""
+    """Each an arm, or an arm and the one that it is compared with."""
     width: float | None
     """Points below which every target's interval must be; None where it must exclude 0."""
     every: int

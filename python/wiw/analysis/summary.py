@@ -51,13 +51,13 @@ PLACEBOS = {
 REPEATS = {RESEEDED: "noise floor: the same with other random numbers"}
 """Arms that repeat another one of the run; ":" and a model's name follow."""
 ERROR = "error-"
-"""What the names of arms begin with whose futures have an error of a known dose."""
+"""Beginning of the names of arms whose futures have an error of a known dose."""
 ERRONEOUS = "control: futures with an error of a known dose"
 GAINS = {
     "none": "Gain over the policy without a world model",
     "copy": "Gain over the floor, which predicts that nothing changes",
 }
-"""What a difference from these arms measures."""
+"""Meaning of a difference from each of these arms."""
 BLIND_ROLE = "floor, best guess from the question's text alone"
 WORLD_MODEL, ANOTHER_POLICY = "world model", "another policy without a world model"
 
@@ -97,9 +97,9 @@ class Group:
 
     title: str
     heading: str
-    """What it measures, for the report."""
+    """Meaning of the differences, for the report."""
     corner: str
-    """Which minus which."""
+    """Label of the corner cell: which minus which."""
     rows: Mapping[str, Mapping[str, Difference]]
     """By label of the row, then by metric."""
 

@@ -108,7 +108,7 @@ def study_errors(
     read_only: bool = False,
     workers: Annotated[int, arg(metavar="N")] = 1,
 ) -> int:
-    """What kind of error costs success? The oracle's true futures, made worse by known doses, one error at a time.
+    """Find which kind of error costs success: true futures are made worse by known doses, one error at a time.
 
     $ wiw study errors --small --workers 2                     # imagenav, four errors; about three minutes on two cores
     $ wiw study errors --tasks imagenav --size 144 256 --workers 4

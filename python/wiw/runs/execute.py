@@ -26,8 +26,8 @@ class Look(Protocol):
     """Findings of a look at a run that goes on; its string form is a sentence."""
 
     @property
-    def reached(self) -> bool:
-        """Whether the run stops."""
+    def is_enough(self) -> bool:
+        """Whether the run has shown enough, and stops."""
 
 
 class Looks(Protocol):
@@ -148,8 +148,8 @@ def _split_by_looks(
     for bound in looks.list_bounds(len(episodes)):
         yield {arm: [index for index in left if begin <= index < bound] for arm, left in pending.items()}
         look = looks.look(bound, episodes, store.outcomes())
-        board.note(f"{look}{', so the run stops' if look.reached else ''}")
-        if look.reached:
+        board.note(f"{look}{', so the run stops' if look.is_enough else ''}")
+        if look.is_enough:
             store.stop_after(bound, str(look))
             return
         begin = bound

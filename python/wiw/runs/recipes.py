@@ -33,11 +33,11 @@ from wiw.types import PRIMITIVES
 from wiw.world_models.base import WorldModel
 
 PLACEBO, PLACEBO_MODEL = "placebo-", "warp"
-"""What arms of placebos begin with, and the model that they are of where nobody names one."""
+"""Beginning of the names of placebo arms, and the model that they use where nobody names one."""
 RESEEDED = "reseeded"
 """Begins arms that repeat another with other random numbers: the noise floor."""
 ERROR, ERROR_MODEL = "error-", "oracle"
-"""What arms with an error begin with, and the model that they are of where nobody names one."""
+"""Beginning of the names of arms with an error, and the model that they use where nobody names one."""
 REFERENCES = ("none", "copy", "oracle")
 """Arms that reports know by name: no world model, floor and ceiling."""
 ELSEWHERE = ("vlm", "cache", "prices", "concurrency", "timeout", "attempts")
@@ -88,14 +88,14 @@ class AgentRecipe(AgentConfig):
     """KIND@DOSE of an error that the world model's futures have (`wiw.experiments.errors`)."""
     imagine_fraction: float | None = None
     model_options: Mapping[str, Any] = field(default_factory=dict)
-    """What the world model is made with, by name."""
+    """Arguments of the world model, by name."""
     policy_options: Mapping[str, Mapping[str, Any]] = field(default_factory=dict)
     """Options of policies, by their names: {"vlm": {"vlm": "http://localhost:8000/v1"}}."""
     ground_truth: Sequence[str] = ()
     """Stages that are given the ground truth (`wiw.experiments.ground_truth`)."""
     semantics: Any = None
     semantics_options: Mapping[str, Any] = field(default_factory=dict)
-    """What the source of semantics is made with."""
+    """Arguments of the source of semantics."""
     tracker: Any = None
     """Finds the target in imagined frames, for the policy that revises; None: that policy's own."""
     tracker_options: Mapping[str, Any] = field(default_factory=dict)

@@ -34,7 +34,7 @@ Row = RestartRow | AgentRow | DecisionRow | LostRow | OutcomeRow
 _RESEED = 0x52455345
 """Keeps the seeds of arms that repeat another apart from all other draws."""
 TRIES = 2
-"""How often an episode is begun whose worker dies."""
+"""Times that an episode is begun whose worker dies."""
 NUMBERS = {2: "twice", 3: "three times"}
 
 
@@ -58,13 +58,13 @@ class WorkerSpec:
     """Recipes by arm."""
     seed: int
     salt: str
-    """Of keys and seeds, as `wiw.loop.keys` has it."""
+    """Salt of keys and seeds; see `wiw.loop.keys`."""
     live: int
     """Episodes kept live at a time in one process."""
     pictures: frozenset[int]
     """Episodes whose decisions keep pictures."""
     limits: Mapping[str, Any] = field(default_factory=dict)
-    """What every agent is built with beyond its recipe; see `AgentRecipe.build`."""
+    """Arguments of every agent beyond its recipe; see `AgentRecipe.build`."""
     episodes: Sequence[Episode] = ()
     """All episodes of the run, for placebos, which use the observations of other episodes."""
     sources: Mapping[str, str] = field(default_factory=dict)

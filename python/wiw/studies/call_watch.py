@@ -29,7 +29,7 @@ Frames = NDArray[np.uint8]
 
 @dataclass
 class Watched:
-    """What a model has done so far."""
+    """Record of what a model has done so far."""
 
     changed: tuple[str, ...] = ()
     """Names of the inputs that it has changed."""

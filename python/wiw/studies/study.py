@@ -31,13 +31,13 @@ FILE = "study.yaml"
 
 @dataclass(frozen=True)
 class StudyPart:
-    """What came of one run of a study."""
+    """Outcome of one run of a study."""
 
     run: StudyRun
     log: RunLog
     numbers: SummaryTable
     differences: tuple[Difference, ...]
-    """Of the pairs that the study compares, Holm-adjusted over them."""
+    """Differences of the pairs that the study compares, Holm-adjusted over them."""
     rollouts: Mapping[str, float]
     """Imagined futures per episode, by arm."""
     quality: QualityTable | None = None

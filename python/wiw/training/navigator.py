@@ -301,9 +301,9 @@ class _Measured:
     bearings: NDArray[np.float64]
     """True azimuths."""
     similarity: NDArray[np.float64]
-    """Of the matcher, at the best heading,"""
+    """Similarity that the matcher finds at its best heading."""
     similar_heading: NDArray[np.float64]
-    """and the azimuth of that heading."""
+    """Azimuth of the matcher's best heading."""
     estimates: PlaceEstimates
 
 

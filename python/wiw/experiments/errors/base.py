@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What an error of imagined futures is, and how one of a known dose is written: KIND@DOSE, such as `blur@16`."""
+"""Errors of imagined futures, and how one of a known dose is written: KIND@DOSE, such as `blur@16`."""
 
 from __future__ import annotations
 

@@ -33,11 +33,11 @@ class MovedRenderer:
 
     def panorama(self, poses: ArrayLike, size: tuple[int, int], color: Any, depth: Any, instance: Any) -> None:
         """Render panoramas as `wiw._core.render.Renderer.panorama` does."""
-        with self._moved():
+        with self._move_instances():
             self._renderer.panorama(poses, size, color, depth, instance)
 
     @contextmanager
-    def _moved(self) -> Iterator[None]:
+    def _move_instances(self) -> Iterator[None]:
         if len(self._ids):
             self._renderer.set_poses(self._ids, self._poses)
         try:

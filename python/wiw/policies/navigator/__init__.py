@@ -78,20 +78,20 @@ class Memory:
     template: appearance.GoalTemplate
     grid: OccupancyGrid = field(default_factory=OccupancyGrid)
     real: list[Evidence] = field(default_factory=list)
-    """Of every place where the agent has observed, the first one included."""
+    """One for every place where the agent has observed, the first one included."""
     imagined: list[Evidence] = field(default_factory=list)
-    """Of imagined places that the agent has not come near to yet."""
+    """One for each imagined place that the agent has not come near to yet."""
     target: NDArray[np.float64] | None = None
     """float64 [2]: where the agent is heading."""
     pose: NDArray[np.float64] = field(default_factory=lambda: np.zeros(3))
-    """Where the agent stood at its last observation,"""
+    """float64 [3]: where the agent stood at its last observation."""
     executed: int = 0
-    """after so many primitives."""
+    """Primitives executed until that observation."""
 
 
 @dataclass(frozen=True)
 class _Outlook:
-    """What a decision is based on: the map, the ways from where the agent and its evidence are, and the belief."""
+    """Grounds of a decision: the map, the ways from where the agent and its evidence are, and the belief."""
 
     way_map: WayMap
     ways: Ways

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Where the goal may be: a distribution over the map, from what each place, real or imagined, says of it."""
+"""Belief about where the goal is: a distribution over the map, from the evidence of real and imagined places."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from wiw.policies.navigator.ways import SIDE, WayMap, Ways, find_near, get_centr
 VISITED = 0.45
 """Metres around where the agent has been in which the goal is not: the episode would have ended."""
 UNKNOWN_PRIOR = 0.6
-"""How likely the goal is in an unknown cell, beside one of known floor."""
+"""Likelihood of the goal in an unknown cell, relative to one of known floor."""
 SMOOTHING = 1.0
 """Standard deviation, in cells, by which the belief is smoothed before its peaks are found."""
 PEAK_GAP = 1.2
@@ -26,7 +26,7 @@ LEAST_LOG = -2.5
 
 @dataclass(frozen=True)
 class Evidence:
-    """What a place says of the goal."""
+    """Evidence about the goal from one place."""
 
     pose: NDArray[np.float64]
     """float64 [3]: x, y and the azimuth of the panorama's front, in the frame of the start."""

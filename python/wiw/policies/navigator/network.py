@@ -44,7 +44,7 @@ class Features:
 
 @dataclass(frozen=True)
 class Estimate:
-    """What the network says of N pairs, as logits."""
+    """Output of the network for N pairs, as logits."""
 
     bearings: Tensor
     """[N, 32], by column of the panorama from its left edge on."""
