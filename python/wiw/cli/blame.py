@@ -93,14 +93,14 @@ def _parse_revision_options(run: Path, pairs: tuple[str, ...]) -> dict[str, Any]
         ArgumentError: its arms have different ones.
     """
     from wiw.registry import POLICIES
-    from wiw.runs.execute import recipes_of
+    from wiw.runs.execute import read_recipes
     from wiw.runs.part_options import parse_options
     from wiw.runs.store import RunStore
 
     if not pairs:
         return {}
     with RunStore.read(run) as store:
-        _, agents = recipes_of(store)
+        _, agents = read_recipes(store)
     revisers = {str(recipe.reviser or recipe.policy) for recipe in agents.values()}
     if len(revisers) > 1:
         raise ArgumentError(f"--revision-option: the arms have several policies that revise: {', '.join(revisers)}")

@@ -44,7 +44,7 @@ PROCESSES = EngineConfig()
 """Processes of this machine."""
 
 
-def recipes_of(store: RunStore) -> tuple[TaskRecipe, dict[str, AgentRecipe]]:
+def read_recipes(store: RunStore) -> tuple[TaskRecipe, dict[str, AgentRecipe]]:
     """Return the recipes of a run's task and agents.
 
     Raises:

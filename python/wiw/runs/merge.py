@@ -17,7 +17,7 @@ from typing import Any
 
 from wiw.errors import Error, StoreError
 from wiw.registry import POLICIES, TASKS, WORLD_MODELS
-from wiw.runs.execute import draw_pictures, recipes_of
+from wiw.runs.execute import draw_pictures, read_recipes
 from wiw.runs.pictures import drop_spare_pictures
 from wiw.runs.rows import to_json
 from wiw.runs.run import find_stores
@@ -235,7 +235,7 @@ def _merge_info(parts: Sequence[RunStore]) -> dict[str, Any]:
 def _draw_pictures(store: RunStore) -> str:
     """Draw maps and films as at the end of a run; return why that cannot be done here."""
     try:
-        task, _ = recipes_of(store)
+        task, _ = read_recipes(store)
         draw_pictures(store, task.build())
     except Error as error:
         return str(error)

@@ -17,7 +17,7 @@ from pathlib import Path
 from typing import Any
 
 from wiw.errors import ArgumentError, StoreError
-from wiw.runs.execute import recipes_of, require_own_sources, require_scenes
+from wiw.runs.execute import read_recipes, require_own_sources, require_scenes
 from wiw.runs.rows import AgentRow, DecisionRow, LostRow, OutcomeRow, RestartRow, to_json
 from wiw.runs.store import DECISION_JSON, RunStore
 from wiw.runs.workers import Job, Runner, WorkerSpec
@@ -102,7 +102,7 @@ def verify(run: str | Path, episodes: int = 3, seed: int = 0) -> Verification:
 
 
 def _run_again(store: RunStore, keys: set[tuple[str, int]]) -> dict[tuple[str, int], Facts]:
-    task, agents = recipes_of(store)
+    task, agents = read_recipes(store)
     require_own_sources(store, task, agents)
     built, info, all_episodes = task.build(), store.info, store.episodes()
     store.require_task(built.describe())

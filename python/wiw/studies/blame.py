@@ -17,7 +17,7 @@ from wiw.analysis.blame import FOLDER, Blame, list_failures, list_reruns, name_r
 from wiw.analysis.blame_schemes import Scheme, choose_scheme
 from wiw.errors import ArgumentError
 from wiw.experiments.counterparts import find_counterpart
-from wiw.runs.execute import recipes_of, require_own_sources, require_scenes, run_pending
+from wiw.runs.execute import read_recipes, require_own_sources, require_scenes, run_pending
 from wiw.runs.platform import describe_platform
 from wiw.runs.recipes import AgentRecipe
 from wiw.runs.store import RunStore
@@ -148,7 +148,7 @@ def _recipes(base: RunStore, wanted: Mapping[str, set[int]]) -> tuple[Any, dict[
         FileError: a scene is not there.
     """
     base.require_version()
-    task, agents = recipes_of(base)
+    task, agents = read_recipes(base)
     require_own_sources(base, task, agents)
     built, episodes, scheme = task.build(), base.episodes(), choose_scheme(base.config["task"])
     base.require_task(built.describe())

@@ -18,7 +18,7 @@ from wiw.loop.limits import Limits
 from wiw.metrics import Lpips
 from wiw.runs.config import EngineConfig, ResumeConfig, RunConfig, read_resume_settings, take_settings
 from wiw.runs.departures import describe_departures
-from wiw.runs.execute import recipes_of, require_left, require_own_sources, run_pending, sources_of
+from wiw.runs.execute import read_recipes, require_left, require_own_sources, run_pending, sources_of
 from wiw.runs.pictures import pool_episodes
 from wiw.runs.platform import describe_platform
 from wiw.runs.recipes import TaskInMemory, TaskRecipe, agent_recipe, arm_recipes, task_recipe
@@ -129,7 +129,7 @@ def resume_run(
         if "attributes" in store.config:
             own, whole = store.path.parent, store.path.parent.parent
             raise StoreError(f"{own} holds the reruns of `wiw blame {whole}`; resume them by that command")
-        task, agents = recipes_of(store)
+        task, agents = read_recipes(store)
         require_own_sources(store, task, agents)
         built = task.build()
         store.require_task(built.describe())
