@@ -234,6 +234,17 @@ def test_routes_stay_on_the_cropped_floor(horizon: int) -> None:
     assert floor.occupied[:3].all() and floor.occupied[:, -3:].all() and floor.free[8, 8]
 
 
+def test_targets_to_which_no_way_leads_are_left_out() -> None:
+    grid = known_floor((1.0, 1.2, -10, 10), side=10)  # a wall from edge to edge
+    way_map = WayMap(grid)
+    ways = way_map.measure_ways(np.zeros((1, 2)))
+    here, beyond = (int(cell) for cell in to_cells(np.array([[0.1, 2.1], [2.1, 0.1]])))
+    assert np.isinf(ways.metres[0, beyond])
+    both = list_candidates(grid, way_map, ways, np.zeros(3), [beyond, here], 8)
+    (nowhere, *_), (route, *_) = list_candidates(grid, way_map, ways, np.zeros(3), [beyond], 8), both
+    assert route.poses[-1, 1] > 0.5 and len(nowhere.actions) > 0
+
+
 def test_where_no_way_leads_anywhere_the_agent_looks_around() -> None:
     grid = known_floor((-4, 4, -4, -0.15), (-4, 4, 0.15, 4), (-4, -0.15, -4, 4), (0.15, 4, -4, 4))
     way_map = WayMap(grid)

@@ -65,11 +65,12 @@ def list_candidates(
         way_map: the same, coarser, with what may be floor.
         ways: from where the agent stands, one row.
         pose: x, y, azimuth of the agent.
-        targets: cells of the way map.
+        targets: cells of the way map; those to which there is no way are left out.
         horizon: L.
     """
     floor = crop_floor(grid, pose, (horizon + LEEWAY) * STEP)
-    stops = [_find_stop(way_map, ways, target, horizon) for target in targets]
+    reachable = [target for target in targets if np.isfinite(ways.metres[0, target])]
+    stops = [_find_stop(way_map, ways, target, horizon) for target in reachable]
     plans = [_plan_route(floor, pose, [stop, *stops], horizon) for stop in stops]
     for k in range(HEADINGS):
         run = follow_heading(grid, pose, float(pose[2]) + k * TURN, horizon * STEP)
