@@ -411,6 +411,8 @@ def test_each_task_names_the_policy_that_runs_it():
     assert found == ["matcher", "recogniser", "scripted"]
     named = [name for name in TASKS.names() if TASKS.find(name).default_policy]
     assert {default_policy(name) for name in named} <= set(POLICIES.names())
+    assert default_policy("imagenav", "foresight") == "navigator"
+    assert default_policy("ar", "foresight") == "recogniser"
     with pytest.raises(ArgumentError, match="names no default"):
         default_policy(f"{Path(__file__).parent / 'fakes.py'}:LineTask")
 

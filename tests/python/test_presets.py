@@ -37,7 +37,7 @@ def write_preset(folder: Path, text: str) -> Path:
 
 
 def test_shipped_presets_hold_the_published_rules() -> None:
-    assert presets.list_presets("imagenav") == ["default", "paper", "official"]
+    assert presets.list_presets("imagenav") == ["default", "paper", "foresight", "official"]
     assert asdict(ImageNav().rules) == asdict(ImageNav(preset="paper").rules) == PAPER
     assert asdict(ImageNav(preset="official").rules) == OFFICIAL
     assert ImageNav(preset="official").budget == 21 * 3
@@ -72,7 +72,8 @@ def test_a_file_of_ones_own_starts_from_a_shipped_preset(tmp_path: Path) -> None
         ("horizon: 0", ArgumentError, "must be positive"),
         ("generator: 3", ArgumentError, "own.yaml: generator: expected rules of generated episodes"),
         ("generator: {nearby: 3}", ArgumentError, "unknown rules nearby"),
-        ("base: mine", ArgumentError, "base 'mine' is not one of default, paper, official"),
+        ("policy: [navigator]", ArgumentError, "policy: expected the name of a policy"),
+        ("base: mine", ArgumentError, "base 'mine' is not one of default, paper, foresight, official"),
         ("- 1\n- 2", FileError, "expected rules as `name: value` lines, got list"),
         ("a: [", FileError, "own.yaml"),
     ],
@@ -84,7 +85,7 @@ def test_what_is_wrong_in_a_file_is_named(tmp_path: Path, text: str, error: type
 
 def test_a_preset_that_is_not_there_is_named(tmp_path: Path) -> None:
     with pytest.raises(
-        ArgumentError, match=r"no preset 'offical'; there are default, paper, official, or give the path"
+        ArgumentError, match=r"no preset 'offical'; there are default, paper, foresight, official, or give the path"
     ):
         ImageNav(preset="offical")
     with pytest.raises(FileError, match=r"none\.yaml"):

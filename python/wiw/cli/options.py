@@ -82,15 +82,17 @@ def task_options(task: str, pairs: Sequence[str], flags: Mapping[str, Any]) -> d
     return {**{name: value for name, value in flags.items() if value is not None}, **options}
 
 
-def default_policy(task: str) -> str:
-    """Return what runs a task where `--policy` names nothing.
+def default_policy(task: str, preset: str | None = None) -> str:
+    """Return the policy that runs a task where `--policy` names none: the preset's, or else the task's.
 
     Raises:
-        ArgumentError: the task names none either.
+        ArgumentError: they name none either; or no such preset.
     """
     from wiw.registry import task_class
+    from wiw.tasks.presets import DEFAULT, find_owner, load_preset
 
-    name = task_class(task).default_policy
+    kind = task_class(task)
+    name = load_preset(find_owner(kind), preset or DEFAULT).policy or kind.default_policy
     if name is None:
         raise ArgumentError(f"--policy: task '{task}' names no default; choose one of `wiw list policies`")
     return str(name)

@@ -53,8 +53,8 @@ class TaskFlags:
     robot: Annotated[Path | None, arg(metavar="URDF")] = None
     """For manipulation: description of an arm to work with; the Franka Panda, of simple shapes, if not given."""
     preset: Annotated[str | None, arg(metavar="NAME|FILE")] = None
-    """All that a number depends on: default, paper, official (its published code), foresight (of ar), or a YAML file of
-    your own; what the command line says goes before it. See `wiw list presets`."""
+    """All that a number depends on: default, paper, official (its published code), foresight (of ar and imagenav), or
+    a YAML file of your own; what the command line says goes before it. See `wiw list presets`."""
     task_option: Options = ()
     """A rule of the preset, such as decisions=10, or another option of the task, such as categories=bed,sofa; may be
     given again."""
@@ -118,8 +118,10 @@ class AgentFlags:
     semantics_option: Options = ()
     """An option of --semantics, such as weights=FILE; may be given again."""
 
-    def make_recipe(self, task: str, search: PlanConfig, policies: Sequence[str] = ()) -> AgentRecipe:
-        """Return the recipe of an agent for a task; `policies` are further ones that arms name.
+    def make_recipe(
+        self, task: str, preset: str | None, search: PlanConfig, policies: Sequence[str] = ()
+    ) -> AgentRecipe:
+        """Return the recipe of an agent for a task and its preset; `policies` are further ones that arms name.
 
         Raises:
             ArgumentError: options without the part that takes them; a width without depth.
@@ -130,7 +132,7 @@ class AgentFlags:
             raise ArgumentError(
                 "--width: a search of one level extends no plan; give --depth 2 or more, or leave it out"
             )
-        policy, reviser = absolute(self.policy or default_policy(task)), self.revision and absolute(self.revision)
+        policy, reviser = absolute(self.policy or default_policy(task, preset)), self.revision and absolute(self.revision)
         options = policy_options(policy, self.policy_option, self._vlm_options([policy, reviser or "", *policies]))
         model = None if self.world_model == "none" else absolute(self.world_model)
         return AgentRecipe(

@@ -11,10 +11,11 @@ from wiw.tasks.presets import DEFAULT, Preset, load_preset
 
 
 def list_settings(task: str, preset: str | Path) -> list[str]:
-    """Return what a preset sets otherwise than the default: a line for rules, for generated episodes, and one for each
-    policy and model.
+    """Return what a preset sets otherwise than the default: a line for the policy that it names, for rules, for generated
+    episodes, and one for the options of each policy and model.
     """
     ours, base = load_preset(task, preset), load_preset(task, DEFAULT)
+    named = [f"policy: {ours.policy}"] if ours.policy != base.policy else []
     general = [
         f"{title}: {changes}"
         for title, own, others in (
@@ -29,7 +30,7 @@ def list_settings(task: str, preset: str | Path) -> list[str]:
         for name, options in getattr(ours, kind).items()
         if (changes := _list_changes(options, getattr(base, kind).get(name, {})))
     ]
-    return [*general, *parts]
+    return [*named, *general, *parts]
 
 
 def list_reasons(task: str, preset: str | Path) -> Iterator[str]:

@@ -137,7 +137,7 @@ def prepare_run(
     seed = config.seed or 0
     names = _arms(arms, parts.world_model)
     policies = [parse_arm(name).model.partition("+")[0] for name in names or []]
-    recipe, agent = rules.make_recipe(task, seed), parts.make_recipe(task, search, policies)
+    recipe, agent = rules.make_recipe(task, seed), parts.make_recipe(task, rules.preset, search, policies)
     folder = Path(config.out or Path("runs") / f"{task.rpartition(':')[2]}-{datetime.now():%Y%m%d-%H%M%S}")
     if config.out is None and config.shard is not None:
         folder = folder / Shard.parse(config.shard).folder

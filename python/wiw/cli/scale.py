@@ -52,7 +52,7 @@ def scale(
     from wiw.studies.scale import scale as run_scale
 
     seed = config.seed or 0
-    recipe, agent = rules.make_recipe(task, seed), parts.make_recipe(task, search)
+    recipe, agent = rules.make_recipe(task, seed), parts.make_recipe(task, rules.preset, search)
     folder = Path(config.out or Path("runs") / f"scale-{datetime.now():%Y%m%d-%H%M%S}")
     settings = replace(config, seed=seed, out=folder)
     counts, shares = (

@@ -4,6 +4,7 @@ user's.
 
 base: official        # a shipped preset that holds where this file says nothing; `default` if left out
 about: our long run   # one line for `wiw list`
+policy: navigator     # which policy runs the task where none is named; the task's own if left out
 decisions: 40         # rules of the task
 generator:            # rules that generated episodes satisfy
   farthest: 4.0
@@ -28,7 +29,7 @@ from wiw.suggestions import did_you_mean
 
 FOLDER = Path(__file__).parents[1] / "configs"
 DEFAULT, PAPER = "default", "paper"
-HEADER = ("base", "about", "generator", "policies", "models", "departures")
+HEADER = ("base", "about", "policy", "generator", "policies", "models", "departures")
 """Keys that are no rules."""
 CONCERNS = ("rules", "vlm", "models", "text models")
 """Whom a departure concerns: every run, runs with policy `vlm`, with a world model, with one that is told words."""
@@ -49,6 +50,8 @@ class Preset:
     """Rules of generated episodes, checked by the task that generates them."""
     policies: Options = field(default_factory=dict)
     models: Options = field(default_factory=dict)
+    policy: str | None = None
+    """Name of the policy that runs the task where none is named; the task's own if None."""
     departures: Mapping[str, Mapping[str, str]] = field(default_factory=dict)
     """Reasons for departures from the paper, by whom they concern (`CONCERNS`) and what they are about."""
 
@@ -65,15 +68,17 @@ def load_preset(task: str, preset: str | Path) -> Preset:
     policies: dict[str, dict[str, Any]] = {}
     models: dict[str, dict[str, Any]] = {}
     reasons: dict[str, dict[str, Any]] = {}
+    policy: str | None = None
     for path in _chain(task, preset):
         content = _read(path)
+        policy = _read_policy(content, path) or policy
         rules |= _without_header(content)
         generator |= _read_generator_rules(content, path)
         _add_options(policies, _read_options(content, "policies", path))
         _add_options(models, _read_options(content, "models", path))
         _add_options(reasons, _read_departures(content, path))
     given = {who: {topic: str(why) for topic, why in own.items() if why} for who, own in reasons.items()}
-    return Preset(rules, generator, policies, models, given)
+    return Preset(rules, generator, policies, models, policy, given)
 
 
 def list_presets(task: str) -> list[str]:
@@ -191,6 +196,13 @@ def _read(path: Path) -> Mapping[str, Any]:
 
 def _without_header(content: Mapping[str, Any]) -> dict[str, Any]:
     return {name: value for name, value in content.items() if name not in HEADER}
+
+
+def _read_policy(content: Mapping[str, Any], path: Path) -> str | None:
+    policy = content.get("policy")
+    if not isinstance(policy, str | None):
+        raise ArgumentError(f"{path}: policy: expected the name of a policy, see `wiw list policies`, got {policy!r}")
+    return policy
 
 
 def _read_generator_rules(content: Mapping[str, Any], path: Path) -> Mapping[str, Any]:
