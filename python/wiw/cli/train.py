@@ -527,14 +527,15 @@ def _check_out(out: Path) -> None:
 
 
 def _check_scenes(scenes: str, val: str) -> None:
-    """Check that no scene is both trained and evaluated on."""
+    """Check that no scene is both trained and evaluated on, whatever its path or the edits of an apartment."""
     from wiw.errors import ArgumentError
-    from wiw.scenes import resolve
+    from wiw.scenes import absolute, resolve, strip_edits
 
-    shared = sorted(set(resolve(scenes)) & set(resolve(val)))
-    if shared:
+    trained = {strip_edits(absolute(name)) for name in resolve(scenes)}
+    shared = next((name for name in resolve(val) if strip_edits(absolute(name)) in trained), None)
+    if shared is not None:
         raise ArgumentError(
-            f"--val: expected held-out scenes that are not among --scenes, got {shared[0]} in both; choose others"
+            f"--val: expected held-out scenes that are not among --scenes, got {shared} in both; choose others"
         )
 
 
