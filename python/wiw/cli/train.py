@@ -168,10 +168,11 @@ def train(
             plans agrees with the true one.
         tracker: Program that draws loss and validation of pocket or a video model; needs its package.
             OUT.log/metrics.jsonl has the same in any case.
-        scenes: Training scenes of recogniser, navigator, warpnet and perception: apartments:train[:N], a mesh or a
-            Gazebo world. Default: apartments:train:160; 80 of them for warpnet, 200 for navigator.
-        val: Held-out scenes of recogniser, navigator, warpnet, pocket and perception. recogniser splits them, or the
-            samples of a single one, into halves for calibration and evaluation. Default: apartments:val:20.
+        scenes: Training scenes of recogniser, navigator, warpnet and perception: apartments:train[:N], a mesh, a Gazebo
+            world or scans, as in `wiw run`. Default: apartments:train:160; 80 of them for warpnet, 200 for navigator.
+        val: Held-out scenes of recogniser, navigator, warpnet, pocket and perception; none may be trained on.
+            recogniser splits them, or the samples of a single one, into halves for calibration and evaluation. Default:
+            apartments:val:20.
         categories: What recogniser tells apart. Default: the built-in list of 26 categories.
         demonstrations: Folder of `wiw collect manipulation`: with depth for diffuser; additional data for armnet.
         epochs: How often each sample is used, on average. Default: 25 for recogniser, 6 for warpnet, 1 for pocket, 4
