@@ -7,6 +7,7 @@ import os
 import signal
 import subprocess
 import sys
+from contextlib import suppress
 from pathlib import Path
 
 import numpy as np
@@ -59,7 +60,7 @@ def test_a_process_that_dies_is_an_error_and_what_is_built_stays(tmp_path: Path)
 
 def test_a_file_that_cannot_be_read_back_is_an_error(tmp_path: Path) -> None:
     job = Job("letters", ("name", "another field"), name_itself, ("letters",))
-    with pytest.raises(FileError, match="letters: .*npz"):
+    with pytest.raises(FileError, match=r"letters: .*npz"):
         gather_arrays({"a": "a"}, job, tmp_path, 1, lambda items, text, total: items)
 
 
@@ -77,7 +78,5 @@ def test_workers_end_with_the_process_that_started_them(tmp_path: Path) -> None:
         process.communicate(timeout=30)
         assert process.returncode == -signal.SIGTERM
     finally:
-        try:
+        with suppress(ProcessLookupError):
             os.killpg(process.pid, signal.SIGKILL)
-        except ProcessLookupError:
-            pass
