@@ -565,8 +565,8 @@ def _report_warpnet(card: dict[str, Any]) -> None:
 def _report_navigator(card: dict[str, Any]) -> None:
     held_out, other = card["held_out"], "the matcher's similarity"
     print(f"{card['places']} places, {card['recipe']['epochs']} epochs; held out: {held_out['pairs']} pairs")
-    auc = held_out["auc"]
-    print(f"AUC within 2 m: network {auc['network']:.3f}, {other} {auc['similarity']:.3f}, both {auc['both']:.3f}")
+    auc = {name: "-" if value is None else f"{value:.3f}" for name, value in held_out["auc"].items()}
+    print(f"AUC within 2 m: network {auc['network']}, {other} {auc['similarity']}, both {auc['both']}")
     for name, row in held_out["bearing"].items():
         if not row["pairs"]:
             continue
