@@ -212,14 +212,16 @@ class Records:
     def __init__(self) -> None:
         self.results: list[EpisodeResult] = []
         self.answers: list[Any] = []
+        self.decisions: list[Any] = []
 
     def decision(self, record):
         self.answers.append(record.decision.answer)
+        self.decisions.append(record)
 
     def episode(self, result):
         self.results.append(result)
 
-    def again(self, episodes):
+    def record_restart(self, episodes):
         pass
 
     def record_lost(self, spent):

@@ -126,6 +126,16 @@ def test_a_scene_counts_once_all_of_it_has_ended():
     assert list_units([episode("house")] * 5, 3) == [[0], [1], [2]]
 
 
+@pytest.mark.parametrize(("scenes", "said"), [(["house"] * 4, "over 4 episodes"), (["a", "b"] * 2, "over 2 scenes")])
+def test_a_look_names_what_it_counts(scenes, said):
+    episodes = [Episode("", scene, (0.0, 0.0, 0.0), 0.0, (0.0, 0.0, 0.0), 0.0, 1.0) for scene in scenes]
+    rows = [{"arm": "none", "episode": i, "status": "done", "metrics": {"success": 1.0}} for i in range(4)]
+    assert str(parse_stop_rule("width<8", ["none"], 4).look(4, episodes, rows)).startswith(
+        "4 of 4 episodes: none 100.0"
+    )
+    assert said in parse_stop_rule("width<8", ["none"], 4).look(4, episodes, rows).text
+
+
 AGENTS = {"none": LineAgent(0.2), "oracle": LineAgent(1.0)}
 
 

@@ -19,6 +19,7 @@ from test_explorer import make_explorer, plain_colors  # noqa: F401 - a fixture
 import wiw
 from wiw.errors import ContractError
 from wiw.experiments.ground_truth import TrueScores
+from wiw.loop.observers import Observer, ScoringBatch
 from wiw.loop.scheduler import run_episodes
 from wiw.mapping import drawing
 from wiw.mapping.drawing import DrawnThing, Plan, draw_map
@@ -28,7 +29,7 @@ from wiw.report.site import write_view
 from wiw.runs.rows import decode_jpeg
 from wiw.runs.store import store_path
 from wiw.studies.evaluate import run_arms
-from wiw.types import Episode
+from wiw.types import Decision, Episode
 
 BLOCK = np.stack(np.meshgrid(np.linspace(1.4, 1.8, 9), np.linspace(-0.2, 0.2, 9)), axis=-1).reshape(-1, 2)
 """Points of a thing right ahead of the start."""
@@ -129,9 +130,9 @@ class Sketcher(SizeReader):
         return {self.name: np.full((20, 30, 3), 10 * situation.key.decision, np.uint8)}
 
 
-def run_line(policy: Any, pictured: tuple[int, ...] = (), reviser: Any = None) -> Records:
+def run_line(policy: Any, pictured: tuple[int, ...] = (), reviser: Any = None, **parts: Any) -> Records:
     task, sink = LineTask(), Records()
-    agent = wiw.Agent(policy, reviser=reviser, **task.defaults)
+    agent = wiw.Agent(policy, reviser=reviser, **parts, **task.defaults)
     run_episodes(task, agent, list(enumerate(task.episodes(3))), seed=0, live=3, sink=sink, pictured=pictured)
     return sink
 
@@ -143,6 +144,31 @@ def test_policies_draw_in_pictured_episodes_only():
     decisions = [decision for index, decision, _ in policy.drawn if index == 1]
     assert len(decisions) == len(policy.drawn) > 1 and decisions == list(range(len(decisions)))
     assert [result.metrics for result in without.results] == [result.metrics for result in some.results]
+
+
+class Telltale(Observer):
+    """Adds to each decision what nobody under test may know."""
+
+    def watch(self, batch: ScoringBatch) -> None:
+        return
+
+    def annotate(self, decision: Decision) -> Decision:
+        return replace(decision, note="the truth")
+
+
+def test_policies_draw_without_what_observers_find_out():
+    shown = []
+
+    class Curious(Sketcher):
+        def draw(self, situation: Any, decision: Any, north: float) -> dict[str, np.ndarray]:
+            shown.append(decision.note)
+            return super().draw(situation, decision, north)
+
+    sink = run_line(Curious(), pictured=(0,), model="copy", observers=[Telltale()])
+    pictured = [record.decision for record in sink.decisions if record.episode == 0]
+    assert len(pictured) > 1 and shown == [""] * len(pictured)
+    assert [each.note for each in pictured] == ["the truth"] * len(pictured)
+    assert all(each.pictures for each in pictured)
 
 
 def test_what_is_up_is_north_of_the_scene():

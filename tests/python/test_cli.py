@@ -13,6 +13,7 @@ from wiw.cli import main
 from wiw.cli.doctor import examine
 from wiw.cli.options import parse_options
 from wiw.errors import ArgumentError
+from wiw.scenes import scans
 from wiw.studies.run_log import load_run
 from wiw.tasks.imagenav import ImageNav
 
@@ -47,6 +48,14 @@ def test_help_teaches_by_examples(capsys):
         printed = capsys.readouterr().out
         assert example in " ".join(printed.split())
         assert len({line.index("$ wiw") for line in printed.splitlines() if "$ wiw" in line}) == 1, "not aligned"
+
+
+@pytest.mark.parametrize("command", [["run"], ["scale"], ["episodes"], ["scenes", "draw"]])
+def test_help_names_every_kind_of_scans(command, capsys):
+    with pytest.raises(SystemExit):
+        main([*command, "--help"])
+    printed = capsys.readouterr().out
+    assert [kind for kind in scans.KINDS if f"{kind}:DIR" not in printed] == []
 
 
 def test_no_command_shows_help_and_a_wrong_one_is_refused(capsys):

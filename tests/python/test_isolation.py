@@ -29,7 +29,7 @@ from wiw.loop.attempts import Attempted, make_model
 from wiw.policies.base import Situation
 from wiw.runs.recipes import AgentRecipe, TaskRecipe
 from wiw.studies.evaluate import evaluate
-from wiw.types import Conditioning, Control, Goal, Key, Observation
+from wiw.types import Conditioning, Control, Decision, Goal, Key, Observation
 
 BAD = f"{Path(__file__).with_name('bad_models.py')}:Bad"
 PEEPING = BAD.replace(":Bad", ":Peeping")
@@ -293,6 +293,21 @@ def test_a_policy_s_new_process_takes_no_memory_for_one_of_the_old_one_s(tmp_pat
     gc.collect()
     assert [look(new), look(new)] == ["look 1, 0 done", "look 2, 0 done"]
     assert policy.spent == {"looks": 5}
+    policy.close()
+
+
+def test_a_policy_in_its_process_is_not_told_where_north_is(tmp_path) -> None:
+    drawing = """
+    def draw(self, situation, decision, north):
+        return {"north": np.full((2, 2, 3), 255 if north else 7, np.uint8)}
+"""
+    (tmp_path / "own.py").write_text(POLICY + drawing)
+    blank, key, goal = np.zeros((8, 16, 3), np.uint8), Key(0, 0), Goal("imagenav")
+    for name, shown in (("", 255), ("isolated:", 7)):
+        policy = wiw.policy(f"{name}{tmp_path / 'own.py'}:Own")
+        situation = Situation(Observation(blank, blank, np.zeros(3)), goal, key, policy.begin(goal, key))
+        decision = Decision(np.zeros(1, np.int8), 1, ())
+        assert policy.draw(situation, decision, 0.75)["north"].max() == shown
     policy.close()
 
 

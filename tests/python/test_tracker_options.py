@@ -140,6 +140,8 @@ def test_blame_finds_weights_and_servers_where_they_are_now_and_no_others(
     elsewhere = ["blame", str(run), "--tracker-option", f"weights={weights}", "--revision-option"]
     assert main([*elsewhere, f"cache={tmp_path}/replies"]) == 0
     assert "imagination" in capsys.readouterr().out
+    assert main([*elsewhere, "cache=off"]) == 2, "all is rerun"
+    assert "nothing left to rerun" in capsys.readouterr().err
     shutil.rmtree(run / "blame")
     assert main([*elsewhere, "tries=9"]) != 0
     assert "tries" in capsys.readouterr().err

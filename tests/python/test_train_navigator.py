@@ -3,6 +3,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -117,6 +118,22 @@ def test_the_network_learns_and_is_measured_beside_the_similarity(places: GoalPl
     assert sum(row["pairs"] for row in found["bearing"].values()) <= 40
     for row in found["bearing"].values():
         assert row["pairs"] == 0 or 0 <= row["network"] <= 180
+
+
+def test_scenes_without_ways_are_left_out_and_what_cannot_be_measured_is_none(places: GoalPlaces) -> None:
+    network, _ = train([places], SMALL)
+    prior = measure_prior([places], SMALL, draws=2)
+    apart = replace(places, distances=np.where(np.eye(len(places)) > 0, 0, np.inf).astype(np.float16))
+    assert require_places([apart, places]) == [places]
+    with pytest.raises(ArgumentError, match="from a place to another"):
+        require_places([apart])
+    assert evaluate(network, prior, [apart, places], 0, most=10)["pairs"] == 10
+    with pytest.raises(ArgumentError, match="within 9 m"):
+        evaluate(network, prior, [apart], 0)
+    far = replace(places, distances=np.where(np.eye(len(places)) > 0, 0, 5).astype(np.float16))
+    found = evaluate(network, prior, [far], 0, most=10)
+    assert found["auc"] == {"network": None, "similarity": None, "both": None}
+    assert [row["pairs"] for row in found["bearing"].values()] == [0, 0, 10]
 
 
 @pytest.mark.nightly

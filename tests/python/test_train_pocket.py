@@ -4,6 +4,7 @@
 from __future__ import annotations
 
 import json
+import shutil
 from pathlib import Path
 from typing import Any
 
@@ -220,12 +221,15 @@ def test_the_command_trains_measures_and_is_run(
     ]
     command = ["train", "pocket", "--data", str(dataset), "--out", str(out), "--cache", str(tmp_path / "cache")]
     command += ["--part", "all", *options]
+    assert main([*command, "--val", two_rooms]) == 2 and not out.exists()
+    assert "trained on, got " + two_rooms in capsys.readouterr().err
+    val = shutil.copy(two_rooms, tmp_path / "another.obj")
     monkeypatch.setattr("wiw.training.pocket.held_out.evaluate", fail)
-    assert main([*command, "--val", two_rooms]) == 2 and "held_out" not in Pocket(out).card
+    assert main([*command, "--val", str(val)]) == 2 and "held_out" not in Pocket(out).card
     monkeypatch.setattr("wiw.training.pocket.held_out.evaluate", partial(evaluate, count=1))
     with monkeypatch.context() as patch:
         patch.setattr(PocketTrainer, "train_step", None)  # what is trained is not trained again, but measured
-        assert main([*command, "--val", two_rooms]) == 0
+        assert main([*command, "--val", str(val)]) == 0
     said = capsys.readouterr().out
     assert "2 steps of 4 clips" in said and "control gap" in said
     card = Pocket(out).card
@@ -239,7 +243,6 @@ def test_the_command_trains_measures_and_is_run(
     [
         ([], "pocket trains on a dataset; give a folder of `wiw collect navigation` by --data"),
         (["--data", "nowhere"], "nowhere"),
-        (["--data", "d", "--val", "castle:1"], "castle:1"),
         (["--data", "d", "--device", "cuda"], "--device: pocket trains on the CPU"),
         (["--data", "d", "--option", "lr=1"], "no recipe has 'lr'"),
     ],
@@ -247,6 +250,12 @@ def test_the_command_trains_measures_and_is_run(
 def test_what_it_cannot_use_is_refused(options: list[str], said: str, tmp_path: Path, capsys: Any) -> None:
     assert main(["train", "pocket", "--out", str(tmp_path / "p"), *options]) == 2
     assert said in capsys.readouterr().err
+
+
+def test_scenes_to_measure_on_must_be_there(dataset: Path, tmp_path: Path, capsys: Any) -> None:
+    command = ["train", "pocket", "--data", str(dataset), "--out", str(tmp_path / "p"), "--part", "all"]
+    assert main([*command, "--val", "castle:1"]) == 2
+    assert "castle:1" in capsys.readouterr().err
 
 
 def test_validation_keeps_the_best_weights_and_changes_no_training(

@@ -297,9 +297,19 @@ def _written(folder: Path, content: bytes) -> Path:
     return file
 
 
-def test_the_command_refuses_what_cannot_end_well(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_the_command_refuses_what_cannot_end_well(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
     assert main(["train", "recogniser", "--out", str(tmp_path / "no" / "x")]) == 2
     assert "folder that exists" in capsys.readouterr().err
     overlapping = ["--scenes", "apartments:train:3", "--val", "apartments:train:1", "--out", str(tmp_path / "x")]
     assert main(["train", "recogniser", *overlapping]) == 2
     assert "apartments:train/0 in both" in capsys.readouterr().err
+    edited = ["--scenes", "apartments:train/0?remove:sofa_1", "--val", "apartments:train:1"]
+    assert main(["train", "recogniser", *edited, "--out", str(tmp_path / "x")]) == 2
+    assert "apartments:train/0 in both" in capsys.readouterr().err
+    (tmp_path / "house.obj").touch()
+    by_two_paths = ["--scenes", "house.obj", "--val", str(tmp_path / "house.obj"), "--out", "x"]
+    monkeypatch.chdir(tmp_path)
+    assert main(["train", "recogniser", *by_two_paths]) == 2
+    assert "house.obj in both" in capsys.readouterr().err

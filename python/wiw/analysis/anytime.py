@@ -12,7 +12,7 @@ only through when one looks.
 from __future__ import annotations
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
 from wiw.analysis.intervals import Array, Interval
 
@@ -63,8 +63,9 @@ def trace_capital(values: Array, means: Array) -> Array:
     """Return the logarithm of the capital after each value, float [values, means], for values and means in [0, 1]."""
     apart = values[:, None] - means
     over, under = apart / means, -apart / (1 - means)
-    logs: list[NDArray[np.float64]] = [
-        np.cumsum(np.log1p(share * bets), axis=0) for bets in (over, under) for share in SHARES
-    ]
-    capital: Array = np.logaddexp.reduce(logs) - np.log(len(logs))
+    capital: Array = np.full(apart.shape, -np.inf)
+    for bets in (over, under):
+        for share in SHARES:  # one at a time: all together they take gigabytes for some thousand values
+            np.logaddexp(capital, np.cumsum(np.log1p(share * bets), axis=0), out=capital)
+    capital -= np.log(2 * len(SHARES))
     return capital

@@ -33,7 +33,7 @@ class Power:
     base: float
     """Success rate of the arm compared with, percent."""
     losses: float
-    """Percent of episodes that only the arm compared with succeeds in."""
+    """Percent of episodes that only the worse arm succeeds in: the one compared with, if the difference is positive."""
     correlation: float
     """Correlation of the differences of two episodes of a scene."""
     per_scene: int

@@ -74,23 +74,28 @@ class StopRule:
             for row in outcomes
             if row["status"] == "done" and SUCCESS.name in row["metrics"]
         }
-        found = [self._look_at(target, order, scores) for target in self.targets]
+        unit = "scene" if len({strip_edits(episode.scene) for episode in episodes}) > 1 else "episode"
+        found = [self._look_at(target, order, scores, unit) for target in self.targets]
         return Look(bound, len(episodes), "; ".join(text for text, _ in found), all(reached for _, reached in found))
 
     def _look_at(
-        self, target: tuple[str, ...], units: Sequence[Sequence[int]], scores: Mapping[tuple[str, int], float]
+        self,
+        target: tuple[str, ...],
+        units: Sequence[Sequence[int]],
+        scores: Mapping[tuple[str, int], float],
+        unit: str,
     ) -> tuple[str, bool]:
         values = list_unit_means(target, units, scores)
-        low, high = measure(target, values)
+        low, high = find_percent_interval(target, values)
         middle = 100 * float(values.mean()) if len(values) else 0.0
         sign = "+" if len(target) == 2 else ""
-        text = f"{'-'.join(target)} {middle:{sign}.1f} [{low:.1f}, {high:.1f}] over {len(values)} scenes"
+        text = f"{'-'.join(target)} {middle:{sign}.1f} [{low:.1f}, {high:.1f}] over {len(values)} {unit}s"
         if self.width is None:
             return text, low > 0 or high < 0
         return f"{text}, width {high - low:.1f}", high - low < self.width
 
 
-def measure(target: Sequence[str], values: Array) -> Interval:
+def find_percent_interval(target: Sequence[str], values: Array) -> Interval:
     """Return the anytime-valid 95 % interval of a rate, or of a difference of two, in percent."""
     low, high = find_anytime_interval(values, bounds=(0.0, 1.0) if len(target) == 1 else (-1.0, 1.0))
     return 100 * low, 100 * high

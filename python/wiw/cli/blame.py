@@ -63,7 +63,8 @@ def blame(
         workers: Processes; as many as the run was started with if not given. Results do not depend on it.
         retry_errors: Whether to repeat reruns that ended with an infrastructure error.
         revision_option: An option of the policy that revises in place of the run's, such as vlm=URL of another server;
-            may be given again. What would change results is refused.
+            may be given again. What would change results is refused, and so are other options where nothing is left to
+            rerun.
         tracker: The tracker by another name, likewise.
         tracker_option: An option of the tracker, such as weights=FOLDER where they lie now; may be given again.
     """

@@ -40,8 +40,8 @@ def check_model(
     Args:
         model: Name, path.py:Class, package.module:Class, or remote:ws://HOST:PORT. See `wiw list`.
         world_model_option: An option of the model, such as weights=FOLDER or steps=30; may be given again.
-        scenes: Source of the observations: apartments:val:1, a mesh, or a Gazebo world. Those of models that take
-            poses of a gripper come from the tables of manipulation.
+        scenes: Source of the observations: apartments:val:1, a mesh, a Gazebo world or scans, as in `wiw run`. Those of
+            models that take poses of a gripper come from the tables of manipulation.
         deadline: Time limit in seconds for a call of the model or its constructor, as in `wiw run`.
     """
     from rich.console import Console

@@ -32,7 +32,7 @@ def collect_decisions(
     how well both orders agree, and how much further from the goal the model's choice ends than the best plan.
 
     Args:
-        scenes: Scenes, which may be of any split: apartments:val:20, a mesh or a Gazebo world.
+        scenes: Scenes, which may be of any split: apartments:val:20, a mesh, a Gazebo world or scans, as in `wiw run`.
         out: New Parquet file: a row a plan, a row group a decision.
         per_scene: Decisions in each scene; fewer where there is no room for more.
         plans: Plans of each decision.

@@ -44,8 +44,8 @@ def episodes(
         task: See `wiw list`.
         out: JSON; gzipped if the name ends in .gz.
         preset: Whose rules the episodes satisfy, such as foresight of ar; default if not given. See `wiw list presets`.
-        scenes: apartments:train|val|test[[:FIRST]:END], a mesh (GLB, glTF, OBJ, PLY, DAE), or a Gazebo world;
-            apartments:val if not given.
+        scenes: apartments:train|val|test[[:FIRST]:END], a mesh (GLB, glTF, OBJ, PLY, DAE), a Gazebo world, or scans
+            (hm3d:DIR:val, mp3d:DIR, replica:DIR, hssd:DIR, replicacad:DIR, procthor:DIR); apartments:val if not given.
         episodes: Number of episodes.
         per_scene: Episodes per scene; the task's own number if not given.
         tier: For imagenav: goals 2 to 5 m away, 5 to 8 m away, or one corner beyond what the start sees, where the way

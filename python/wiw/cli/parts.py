@@ -132,7 +132,10 @@ class AgentFlags:
             raise ArgumentError(
                 "--width: a search of one level extends no plan; give --depth 2 or more, or leave it out"
             )
-        policy, reviser = absolute(self.policy or default_policy(task, preset)), self.revision and absolute(self.revision)
+        policy, reviser = (
+            absolute(self.policy or default_policy(task, preset)),
+            self.revision and absolute(self.revision),
+        )
         options = policy_options(policy, self.policy_option, self._vlm_options([policy, reviser or "", *policies]))
         model = None if self.world_model == "none" else absolute(self.world_model)
         return AgentRecipe(

@@ -24,7 +24,8 @@ def draw_scenes(
 
     Args:
         spec: apartments:train|val|test[[:FIRST]:END], one with edits (apartments:val/3?state:floor_lamp_1=off), a mesh
-            (GLB, glTF, OBJ, PLY, DAE), a Gazebo world, or scans (hm3d:DIR:val, mp3d:DIR, replica:DIR, hssd:DIR).
+            (GLB, glTF, OBJ, PLY, DAE), a Gazebo world, or scans (hm3d:DIR:val, mp3d:DIR, replica:DIR, hssd:DIR,
+            replicacad:DIR, procthor:DIR).
         out: Where to write the sheet, a PNG.
         views: Panoramas per scene.
         backend: Renderer.

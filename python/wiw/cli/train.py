@@ -168,10 +168,11 @@ def train(
             plans agrees with the true one.
         tracker: Program that draws loss and validation of pocket or a video model; needs its package.
             OUT.log/metrics.jsonl has the same in any case.
-        scenes: Training scenes of recogniser, navigator, warpnet and perception: apartments:train[:N], a mesh or a
-            Gazebo world. Default: apartments:train:160; 80 of them for warpnet, 200 for navigator.
-        val: Held-out scenes of recogniser, navigator, warpnet, pocket and perception. recogniser splits them, or the
-            samples of a single one, into halves for calibration and evaluation. Default: apartments:val:20.
+        scenes: Training scenes of recogniser, navigator, warpnet and perception: apartments:train[:N], a mesh, a Gazebo
+            world or scans, as in `wiw run`. Default: apartments:train:160; 80 of them for warpnet, 200 for navigator.
+        val: Held-out scenes of recogniser, navigator, warpnet, pocket and perception; none may be trained on.
+            recogniser splits them, or the samples of a single one, into halves for calibration and evaluation. Default:
+            apartments:val:20.
         categories: What recogniser tells apart. Default: the built-in list of 26 categories.
         demonstrations: Folder of `wiw collect manipulation`: with depth for diffuser; additional data for armnet.
         epochs: How often each sample is used, on average. Default: 25 for recogniser, 6 for warpnet, 1 for pocket, 4
@@ -527,14 +528,15 @@ def _check_out(out: Path) -> None:
 
 
 def _check_scenes(scenes: str, val: str) -> None:
-    """Check that no scene is both trained and evaluated on."""
+    """Check that no scene is both trained and evaluated on, whatever its path or the edits of an apartment."""
     from wiw.errors import ArgumentError
-    from wiw.scenes import resolve
+    from wiw.scenes import absolute, resolve, strip_edits
 
-    shared = sorted(set(resolve(scenes)) & set(resolve(val)))
-    if shared:
+    trained = {strip_edits(absolute(name)) for name in resolve(scenes)}
+    shared = next((name for name in resolve(val) if strip_edits(absolute(name)) in trained), None)
+    if shared is not None:
         raise ArgumentError(
-            f"--val: expected held-out scenes that are not among --scenes, got {shared[0]} in both; choose others"
+            f"--val: expected held-out scenes that are not among --scenes, got {shared} in both; choose others"
         )
 
 
@@ -563,8 +565,8 @@ def _report_warpnet(card: dict[str, Any]) -> None:
 def _report_navigator(card: dict[str, Any]) -> None:
     held_out, other = card["held_out"], "the matcher's similarity"
     print(f"{card['places']} places, {card['recipe']['epochs']} epochs; held out: {held_out['pairs']} pairs")
-    auc = held_out["auc"]
-    print(f"AUC within 2 m: network {auc['network']:.3f}, {other} {auc['similarity']:.3f}, both {auc['both']:.3f}")
+    auc = {name: "-" if value is None else f"{value:.3f}" for name, value in held_out["auc"].items()}
+    print(f"AUC within 2 m: network {auc['network']}, {other} {auc['similarity']}, both {auc['both']}")
     for name, row in held_out["bearing"].items():
         if not row["pairs"]:
             continue

@@ -5,9 +5,12 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from wiw.cli.train_video import TrainingProgress, describe_steps, require_data
+
+if TYPE_CHECKING:
+    from wiw.datasets.navigation import NavigationData
 
 
 def train_pocket(
@@ -35,10 +38,11 @@ def train_pocket(
         bar: wraps an iterable in a progress bar.
 
     Raises:
-        ArgumentError: no data, or scenes that are not there; see also `wiw.training.pocket.train.train_pocket`.
+        ArgumentError: no data, scenes that are not there, or scenes to measure it on that it is trained on; see also
+            `wiw.training.pocket.train.train_pocket`.
     """
+    from wiw.datasets.navigation import NavigationData
     from wiw.runs.part_options import parse_options
-    from wiw.scenes import resolve
     from wiw.training.pocket import train as training
     from wiw.training.pocket.held_out import evaluate
     from wiw.training.pocket.recipe import PocketRecipe
@@ -49,7 +53,7 @@ def train_pocket(
     options = {**numbers, **parse_options(pairs, PocketRecipe, "--option")}
     chosen = load_recipe("pocket", recipe, options, kind=PocketRecipe)
     folder = require_data("pocket", data)
-    resolve(val)  # names that are wrong are better known before hours of training
+    _check_held_out(val, NavigationData(folder, given["part"], chosen.held_out))  # before hours of training
     with TrainingProgress(chosen.batch) as progress:
         card = training.train_pocket(
             folder, out, cache, chosen, on_step=progress, on_validation=progress.show_validation, bar=bar, **given
@@ -59,6 +63,21 @@ def train_pocket(
     save(out, load(out)[0], card)
     _report(card)
     print(f"log       {out}.log")
+
+
+def _check_held_out(val: str, data: NavigationData) -> None:
+    """Check that scenes are there and are not trained on; a dataset knows its scenes by name alone."""
+    from wiw.datasets.scene_splits import name_scene
+    from wiw.errors import ArgumentError
+    from wiw.scenes import resolve, strip_edits
+
+    trained = {strip_edits(row["scene"]) for row in data.segments}
+    shared = next((spec for spec in resolve(val) if strip_edits(name_scene(spec)) in trained), None)
+    if shared is not None:
+        raise ArgumentError(
+            f"--val: expected held-out scenes that are not trained on, got {shared}, and {data.folder} has a scene of "
+            "that name; choose others"
+        )
 
 
 def _report(card: Mapping[str, Any]) -> None:

@@ -151,10 +151,10 @@ class IsolatedPolicy(Isolated, Policy):
         return [_read_answer(each) for each in self._call(answer, _hide_memories(situations), proposals, rollouts)]
 
     def draw(self, situation: Situation, decision: Decision, north: float) -> Mapping[str, NDArray[np.uint8]]:
-        """Return the policy's pictures."""
+        """Return the policy's pictures, in which the heading at the start is up: the true north stays here."""
         if not self._told["draws"]:
             return {}
-        found = self._call(draw, _hide_memories([situation])[0], replace(decision, key=None), north)
+        found = self._call(draw, _hide_memories([situation])[0], replace(decision, key=None), 0.0)
         return {str(name): _read_array("draw", each) for name, each in found.items()}
 
     def exchanges(self, key: Key) -> tuple[Exchange, ...]:

@@ -163,9 +163,11 @@ class DecisionPass:
             exchanges=exchanges,
             **shared,
         )
-        for observer in self._parts.observers:
+        if query.north is not None:
+            decision = self._add_pictures(episode, decision, query.north)
+        for observer in self._parts.observers:  # after the policies have drawn: observers may add what is true
             decision = observer.annotate(decision)
-        return decision if query.north is None else self._add_pictures(episode, decision, query.north)
+        return decision
 
     def _add_pictures(self, episode: int, decision: Decision, north: float) -> Decision:
         """Let the policies draw what they believe. Of pictures of one name that of the reviser is kept."""

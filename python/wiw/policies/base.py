@@ -169,9 +169,10 @@ class Policy(ABC):
 
         Args:
             situation: as at the decision; its memory is up to date.
-            decision: as it was made.
+            decision: as it was made, without what observers measure, such as its fidelity.
             north: azimuth, in the frame of the episode's start, of what is up on maps of the scene, so that a map can
-                be drawn as they are. It comes from the environment, so nothing but pictures may depend on it.
+                be drawn as they are. It comes from the environment, so nothing but pictures may depend on it; a policy
+                in a process of its own is told 0, the heading at the start.
         """
         return {}
 

@@ -66,7 +66,7 @@ def blame(
     Raises:
         ArgumentError: an unknown arm, no failure, a number out of range, a task that does not say what success
             or progress is, or an agent that cannot use the ground truth, such as one without a reviser, or one that
-            answers questions with another policy than `explorer`.
+            answers questions with another policy than `explorer`; or other options where nothing is left to rerun.
         StoreError: no readable run, one that was begun with objects in memory or by another version, or whose task,
             agents or navigation meshes have changed.
         FileError: a scene is not there.
@@ -80,11 +80,18 @@ def blame(
         store = _store(base, agents)
         named = {name_rerun(arm, rerun): indices for arm, indices in wanted.items() for rerun in list_reruns(base, arm)}
         pending = {name: sorted({*store.pending(name, retry_errors)} & indices) for name, indices in named.items()}
-        moved = {
+        if (reviser_options or tracker or tracker_options) and not any(pending.values()):
+            store.close()
+            raise ArgumentError(
+                f"blame: {base.path.parent} has nothing left to rerun, so other options of the reviser or the tracker "
+                "change nothing; leave them out to see the verdicts, or repeat reruns that ended with an error "
+                "(--retry-errors)"
+            )
+        relocated = {
             name: _replace_options(agent, reviser_options or {}, tracker, tracker_options or {})
             for name, agent in agents.items()
         }
-        run_pending(store, task, moved, pending, workers or base.info["workers"], progress)
+        run_pending(store, task, relocated, pending, workers or base.info["workers"], progress)
         found = read_blame(base)
         assert found is not None
         return replace(found, arms=tuple(line for line in found.arms if line.arm in wanted))

@@ -7,12 +7,10 @@ from __future__ import annotations
 
 import json
 import zipfile
-from collections.abc import Callable, Iterable, Mapping, Sequence
-from concurrent.futures import ProcessPoolExecutor, as_completed
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import asdict, dataclass
 from functools import partial
 from hashlib import blake2b
-from multiprocessing import get_context
 from pathlib import Path
 from typing import Any
 
@@ -21,6 +19,7 @@ from numpy.typing import NDArray
 
 from wiw import scenes
 from wiw.datasets.worlds import world
+from wiw.errors import FileError
 from wiw.files import atomic_file
 from wiw.perception.glimpses import Glimpses
 from wiw.perception.scene_labels import CATEGORIES
@@ -36,6 +35,7 @@ from wiw.training.glimpse_sets import (
     merge_glimpse_sets,
 )
 from wiw.training.goal_places import GoalPlaces, PlaceRules, record_goal_places, require_places
+from wiw.training.jobs import run_jobs
 from wiw.training.labelled_views import FIELDS as VIEW_FIELDS
 from wiw.training.labelled_views import LabelledViews, ViewRules, change_states, merge_views, record_views
 from wiw.training.walks import WalkRules, Walks, record_walks
@@ -204,43 +204,53 @@ def gather_arrays(sources: Mapping[str, str], job: Job, folder: Path, workers: i
     """Load the arrays of all sources, in order; build those that `folder` lacks in `workers` processes.
 
     Args:
-        sources: maps a unique name of each source to the name that `job.make` takes.
+        sources: maps the name of each source, which `job.make` takes, to one that means the same in any working
+            directory, from which the name of its cache file is computed.
         job: what to build from each.
         folder: the cache.
         workers: number of processes.
         bar: shows the progress.
 
     Raises:
-        FileError: the folder cannot be written.
+        FileError: the folder cannot be written, or a file cannot be read back.
+        InfrastructureError: a worker process has died.
     """
     files = {name: folder / f"{_compute_digest(source, job)}.npz" for name, source in sources.items()}
     found = {name: _read_file(file, job) for name, file in files.items()}
     missing = [name for name, arrays in found.items() if arrays is None]
     list(bar(_build_missing(missing, files, job, workers), job.name, len(missing)))
     found |= {name: _read_file(files[name], job) for name in missing}
-    return [arrays for arrays in found.values() if arrays is not None]
+    return [_require_arrays(found[name], files[name], job) for name in sources]
 
 
-def _build_missing(names: Sequence[str], files: dict[str, Path], job: Job, workers: int) -> Iterable[str]:
+def _require_arrays(arrays: Arrays | None, file: Path, job: Job) -> Arrays:
+    if arrays is None:
+        raise FileError(
+            f"{job.name}: {file} was written and cannot be read back; is something else deleting or writing files "
+            "there? Repeat the command, or choose another folder by --cache"
+        )
+    return arrays
+
+
+def _build_missing(names: Sequence[str], files: Mapping[str, Path], job: Job, workers: int) -> Iterator[str]:
     """Build the files of the given sources; yield each name when its file is complete."""
-    if workers <= 1 or len(names) <= 1:
-        for name in names:
-            yield _build_file(name, files[name], job)
-        return
-    with ProcessPoolExecutor(workers, mp_context=get_context("spawn")) as pool:
-        jobs = [pool.submit(_build_file, name, files[name], job) for name in names]
-        try:
-            for each in as_completed(jobs):
-                yield each.result()
-        finally:
-            pool.shutdown(wait=False, cancel_futures=True)
+    for built, _ in run_jobs([_FileJob(name, files[name], job) for name in names], workers):
+        yield built.name
 
 
-def _build_file(name: str, file: Path, job: Job) -> str:
-    arrays = job.make(name)
-    with atomic_file(file) as draft, draft.open("wb") as stream:
-        np.savez(stream, **arrays)  # type: ignore[arg-type]
-    return name
+@dataclass(frozen=True)
+class _FileJob:
+    """The file of one source."""
+
+    name: str
+    file: Path
+    job: Job
+
+    def run(self) -> None:
+        """Build and write the file."""
+        arrays = self.job.make(self.name)
+        with atomic_file(self.file) as draft, draft.open("wb") as stream:
+            np.savez(stream, **arrays)  # type: ignore[arg-type]
 
 
 def _read_file(file: Path, job: Job) -> Arrays | None:

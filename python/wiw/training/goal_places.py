@@ -115,12 +115,12 @@ def _find_visible(points: NDArray[np.float64], depth: NDArray[np.float32]) -> ND
 
 
 def require_places(parts: Sequence[GoalPlaces]) -> Sequence[GoalPlaces]:
-    """Return the scenes with at least two places.
+    """Return the scenes in which one can walk from a place to another.
 
     Raises:
         ArgumentError: there is none.
     """
-    usable = [part for part in parts if len(part) > 1]
+    usable = [part for part in parts if np.isfinite(part.distances).sum() > len(part)]  # each is 0 m from itself
     if not usable:
         raise ArgumentError("expected scenes in which one can walk from a place to another, got none; name others")
     return usable

@@ -322,13 +322,22 @@ def evaluate(
     Returns:
         {"pairs": N, "auc": {"network": ..., "similarity": ..., "both": ...}, "bearing": {"0.3-2": {"network": ...,
         "similarity": ..., "within_45": ..., "pairs": ...}, ...}}: the probability that a pair within 2 m is rated
-        nearer than one that is farther apart, and median errors of the bearing in degrees by range of distance.
+        nearer than one that is farther apart (None where all pairs are near, or none), and median errors of the bearing
+        in degrees by range of distance.
+
+    Raises:
+        ArgumentError: no two places are within 9 m of each other.
     """
     estimator = GoalEstimator(network, card)
     parts = [
         _measure_scene(estimator, scene, np.random.default_rng(core.fold_key([seed, 0x4C33, i])), most)
         for i, scene in enumerate(scenes)
+        if _find_pairs(scene).any()
     ]
+    if not parts:
+        raise ArgumentError(
+            f"navigator: expected held-out scenes with two places within {FAR:g} m of each other, got none; name others"
+        )
     metres = np.concatenate([part.metres for part in parts])
     similarity = np.concatenate([part.similarity for part in parts])
     rated = -np.concatenate([part.estimates.metres for part in parts])
@@ -336,7 +345,7 @@ def evaluate(
     auc = {"network": rated, "similarity": similarity, "both": _standardise(rated) + _standardise(similarity)}
     return {
         "pairs": len(metres),
-        "auc": {name: round(_compute_auc(values, near), 4) for name, values in auc.items()},
+        "auc": {name: _compute_auc(values, near) for name, values in auc.items()},
         "bearing": {f"{low:g}-{high:g}": _measure_bearing(parts, low, high) for low, high in RANGES},
     }
 
@@ -369,11 +378,15 @@ def _draw_held_out_pairs(
     scene: GoalPlaces, rng: np.random.Generator, most: int
 ) -> tuple[list[tuple[int, int]], list[int]]:
     """Return goals, as place and number of the view, and for each a place at most 9 m from it."""
-    within = (scene.distances <= FAR) & ~np.eye(len(scene), dtype=bool)
-    pairs = np.repeat(np.argwhere(within), GOALS_PER_PLACE, axis=0)
+    pairs = np.repeat(np.argwhere(_find_pairs(scene)), GOALS_PER_PLACE, axis=0)
     views = np.arange(len(pairs)) % GOALS_PER_PLACE
     chosen = rng.permutation(len(pairs))[:most]
     return [(int(pairs[i, 1]), int(views[i])) for i in chosen], [int(pairs[i, 0]) for i in chosen]
+
+
+def _find_pairs(scene: GoalPlaces) -> NDArray[np.bool_]:
+    """Return which places are at most 9 m from which others, bool [N, N]."""
+    return np.asarray((scene.distances <= FAR) & ~np.eye(len(scene), dtype=bool))
 
 
 def _fill_panoramas(bands: NDArray[np.uint8]) -> NDArray[np.uint8]:
@@ -394,11 +407,16 @@ def _standardise(values: NDArray[np.float64]) -> NDArray[np.float64]:
     return (values - values.mean()) / max(float(values.std()), 1e-9)
 
 
-def _compute_auc(values: NDArray[np.float64], positive: NDArray[np.bool_]) -> float:
-    """Return the probability that a positive has a higher value than a negative; ties count half."""
+def _compute_auc(values: NDArray[np.float64], positive: NDArray[np.bool_]) -> float | None:
+    """Return the probability that a positive has a higher value than a negative; ties count half.
+
+    None without a positive or without a negative.
+    """
     count = int(positive.sum())
+    if count in (0, len(values)):
+        return None
     ranks = rankdata(values)[positive].sum() - count * (count + 1) / 2
-    return float(ranks / max(count * (len(values) - count), 1))
+    return round(float(ranks / (count * (len(values) - count))), 4)
 
 
 def _measure_bearing(parts: Sequence[_Measured], low: float, high: float) -> dict[str, float]:

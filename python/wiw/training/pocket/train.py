@@ -22,7 +22,7 @@ from wiw.training.pocket.trainer import PocketTrainer
 from wiw.training.post_training.clip_trainer import arrange_clips
 from wiw.training.post_training.corpora import NavigationCorpus, require_panoramas
 from wiw.training.post_training.stop_signals import SignalledCheckpoint
-from wiw.training.post_training.train import find_held_out, open_log, remove_log, run_steps
+from wiw.training.post_training.train import find_held_out, train_and_validate
 from wiw.training.post_training.validation import CARD, OnValidation, ValidatedTrainer, choose_validation_set
 from wiw.training.reduced_frames import Bar, reduce_frames
 from wiw.world_models.pocket.model import Pocket
@@ -89,18 +89,17 @@ def train_pocket(
         return finished
     trainer = PocketTrainer(clips, reduce_frames(dataset, recipe.size, cache, bar), recipe)
     state = SignalledCheckpoint(out.with_name(f"{out.name}.checkpoint"), {"model": "pocket", **card}, seconds)
-    if not state.path.exists():
-        remove_log(out)
-    validated = ValidatedTrainer(
+    validated = train_and_validate(
         trainer,
         create_sampler(trainer),
         checked,
-        open_log(out, tracker, recipe),
+        out,
         lambda best, found: _save_best(best, trainer, found),
-        lambda: state.save_if_due(validated, recipe.epochs, validated.step_count),
+        state,
+        tracker,
+        on_step,
         on_validation,
     )
-    run_steps(validated, state, on_step)
     card |= {"trained_steps": trainer.step_count, "loss": trainer.mean_loss}
     card = _publish_weights(out, validated, trainer, card)
     state.remove()

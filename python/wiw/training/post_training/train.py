@@ -14,8 +14,9 @@ import wiw
 from wiw.datasets.navigation import NavigationData
 from wiw.errors import ArgumentError, FileError, TrainingError
 from wiw.files import atomic_file, atomic_folder
+from wiw.training.held_out_clips import Imagine
 from wiw.training.post_training import distributed
-from wiw.training.post_training.clip_trainer import arrange_clips
+from wiw.training.post_training.clip_trainer import ClipTrainer, arrange_clips
 from wiw.training.post_training.corpora import Corpus, CorpusPart, NavigationCorpus, open_corpus
 from wiw.training.post_training.families import Family, Loaded, PretrainedWeights, find_family
 from wiw.training.post_training.latent_cache import LatentCache
@@ -25,7 +26,13 @@ from wiw.training.post_training.stop_signals import SignalledCheckpoint
 from wiw.training.post_training.trackers import open_tracker
 from wiw.training.post_training.trainer import PostTrainer
 from wiw.training.post_training.training_log import TrainingLog
-from wiw.training.post_training.validation import CARD, OnValidation, ValidatedTrainer, choose_validation_set
+from wiw.training.post_training.validation import (
+    CARD,
+    OnValidation,
+    ValidatedTrainer,
+    ValidationSet,
+    choose_validation_set,
+)
 from wiw.training.trainer import run_training
 from wiw.types import GRIPPER_POSES, PRIMITIVES
 from wiw.world_models import devices
@@ -113,18 +120,17 @@ def post_train(
         state = open_state(out, card, seconds)
         latents = None if cache is None else open_cache(Path(cache), loaded, corpus)
         trainer = PostTrainer(loaded.model, corpus.clips(recipe.frames), recipe, latents)
-        if not state.path.exists() and distributed.is_main():
-            remove_log(out)
-        validated = ValidatedTrainer(
+        validated = train_and_validate(
             trainer,
             create_sampler(trainer) if checked else None,
             checked,
-            open_log(out, tracker, recipe),
+            out,
             lambda best, found: write_checkpoint(best, trainer, {**card, **found}, lambda _: True),
-            lambda: state.save_if_due(validated, recipe.epochs, validated.step_count),
+            state,
+            tracker,
+            on_step,
             on_validation,
         )
-        run_steps(validated, state, on_step)
     card |= {"trained_steps": trainer.step_count, "loss": trainer.mean_loss}
     card |= {"run": describe_run(family, corpus, recipe)}
     card = publish_checkpoint(out, validated, trainer, card)
@@ -162,15 +168,57 @@ def find_held_out(
     return corpus.data, NavigationData(corpus.data.folder, "held-out", recipe.held_out)
 
 
-def run_steps(
-    trainer: ValidatedTrainer, state: SignalledCheckpoint, on_step: Callable[[int, int, float], None]
-) -> None:
+def train_and_validate(
+    trainer: ClipTrainer,
+    imagine: Imagine | None,
+    validation: ValidationSet | None,
+    out: Path,
+    save: Callable[[Path, Mapping[str, Any]], None],
+    state: SignalledCheckpoint,
+    tracker: str | None,
+    on_step: Callable[[int, int, float], None],
+    on_validation: OnValidation,
+) -> ValidatedTrainer:
     """Train from the start, or from the state that is kept, to the end, and validate what came out.
+
+    Args:
+        trainer: to be trained.
+        imagine: with its networks; None without validation.
+        validation: what it is measured on; None to log alone.
+        out: of the training; its log is in `OUT.log`, and begins anew where no state is kept.
+        save: writes the trainer's weights as a checkpoint, given the folder and what was found.
+        state: of the training; written every so often and at signals.
+        tracker: "trackio", "wandb" or "tensorboard", told what the log is.
+        on_step: called after each step with its number, the number of all steps and a running mean of the loss.
+        on_validation: called after each validation with the number of steps done and what was found.
+
+    Returns:
+        The trainer, which knows where its best weights are.
 
     Raises:
         TrainingError: the loss is not finite; the state before is kept.
+        DependencyError: the tracker's package is not installed.
         ArgumentError, FileError: see `wiw.training.checkpoint.Checkpoint`.
     """
+    if not state.path.exists() and distributed.is_main():
+        shutil.rmtree(locate_log(out), ignore_errors=True)
+    epochs = trainer.recipe.epochs
+    validated = ValidatedTrainer(
+        trainer,
+        imagine,
+        validation,
+        _open_log(out, tracker, trainer.recipe),
+        save,
+        lambda: state.save_if_due(validated, epochs, validated.step_count),
+        on_validation,
+    )
+    _run_steps(validated, state, on_step)
+    return validated
+
+
+def _run_steps(
+    trainer: ValidatedTrainer, state: SignalledCheckpoint, on_step: Callable[[int, int, float], None]
+) -> None:
     inner = trainer.trainer
     recipe, phases = inner.recipe, inner.phases
     with state.watch():
@@ -193,12 +241,8 @@ def run_steps(
             trainer.finish()
 
 
-def open_log(out: Path, tracker: str | None, recipe: ClipRecipe) -> TrainingLog:
-    """Return the log of a training, in `OUT.log`, which a tracker is told as well.
-
-    Raises:
-        DependencyError: the tracker's package is not installed.
-    """
+def _open_log(out: Path, tracker: str | None, recipe: ClipRecipe) -> TrainingLog:
+    """Return the log of a training, which a tracker is told as well."""
     folder, told = locate_log(out), tracker if distributed.is_main() else None
     return TrainingLog(folder / LOG, [open_tracker(told, out.name, folder, recipe.describe())] if told else [])
 
@@ -207,11 +251,6 @@ def open_state(out: Path, identity: Mapping[str, Any], seconds: float) -> Signal
     """Return the state of a training, in `OUT.checkpoint`."""
     path, shared = out.with_name(f"{out.name}.checkpoint"), distributed.count_processes() > 1
     return SignalledCheckpoint(path, identity, seconds, shared=shared)
-
-
-def remove_log(out: Path) -> None:
-    """Remove the log of an earlier training under this name."""
-    shutil.rmtree(locate_log(out), ignore_errors=True)
 
 
 def locate_log(out: Path) -> Path:
