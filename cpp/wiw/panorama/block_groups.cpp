@@ -38,11 +38,17 @@ BlockGroup group_at(const std::uint32_t* texel, const Size& source) {
   }
   group.first = static_cast<std::uint16_t>(all.least);
   group.last = static_cast<std::uint16_t>(all.greatest);
-  // The kernel loads 3 rows for up to two rows of blocks and 5 for more, wherever the columns are moved to.
-  const int last_row = std::max(group.row[0], group.row[1]) + (rows <= 2 ? 2 : kMostGroupRows);
+  // The kernel loads one row more than blocks begin in, wherever the columns are moved to.
+  const int last_row = std::max(group.row[0], group.row[1]) + rows;
   const auto row_bytes = std::int64_t{3} * source.width;
   fits = fits && rows <= kMostGroupRows && last_row * row_bytes + row_bytes - 3 + kLoad <= source.height * row_bytes;
-  group.rows = static_cast<std::uint16_t>(fits ? rows : 0);
+  if (!fits) return group;
+  group.rows = static_cast<std::uint16_t>(rows);
+  for (std::size_t i = 0; i < kGroup; ++i) {
+    const std::size_t half = 2 * i / kGroup;
+    const std::uint32_t row = (texel[i] >> 16) - group.row[half], column = (texel[i] & 0xFFFFu) - group.column[half];
+    group.place[i] = static_cast<std::uint8_t>(64 * row + 32 * half + 3 * column);
+  }
   return group;
 }
 

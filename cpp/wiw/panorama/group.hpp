@@ -16,6 +16,7 @@ struct BlockGroup {
   std::uint16_t column[2];    // and the leftmost column
   std::uint16_t first, last;  // least and greatest column of the sixteen blocks
   std::uint16_t rows;         // blocks of a half begin in so many rows at most; 0: the group cannot be read in this way
+  std::uint8_t place[kGroup];  // of each block's first byte: 64 x its row + 32 x its half + the byte in it
 };
 
 constexpr int kMostGroupRows = 4;

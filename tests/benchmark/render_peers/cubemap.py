@@ -8,6 +8,7 @@ import numpy as np
 from render_scene import panorama_rays
 
 HEIGHT, WIDTH = 576, 1024
+CONVERTED = "converted from six faces"
 FACE = 384  # as many pixels a radian at a face's centre (192) as the panorama has (183)
 
 

@@ -4,14 +4,17 @@ from __future__ import annotations
 import mujoco
 import numpy as np
 
-from render_peers.cubemap import FACE, Cubemap
+from render_peers.cubemap import CONVERTED, FACE, Cubemap
 
 
 class Peer:
     """Colour, depth, segmentation passes of mujoco.Renderer; headlight, no shadows, back faces culled."""
 
     def __init__(self, arrays):
-        self.description = f"mujoco {mujoco.__version__}, EGL"
+        self.description = (
+            f"texture under a headlight, depth and ids in three passes, back faces left out; panorama: {CONVERTED}; "
+            f"mujoco {mujoco.__version__}, EGL"
+        )
         self.model = self._model(arrays)
         self.data = mujoco.MjData(self.model)
         mujoco.mj_forward(self.model, self.data)

@@ -10,7 +10,10 @@ class Peer:
     """RaycastingScene (Embree) for depth and ids; NumPy looks up the nearest texels of colour and light, no mips."""
 
     def __init__(self, arrays):
-        self.description = f"open3d {open3d.__version__} ray casting, NumPy colour"
+        self.description = (
+            "rays; texture and lightmap, nearest texels, by NumPy; depth, ids; panorama: by rays; "
+            f"open3d {open3d.__version__}"
+        )
         self.scene = open3d.t.geometry.RaycastingScene()
         for i in range(len(arrays.vertex_start) - 1):
             vertices = slice(arrays.vertex_start[i], arrays.vertex_start[i + 1])

@@ -9,7 +9,7 @@ import cv2
 import numpy as np
 import pybullet
 
-from render_peers.cubemap import FACE, Cubemap
+from render_peers.cubemap import CONVERTED, FACE, Cubemap
 
 NEAR, FAR = 0.01, 100.0
 
@@ -25,7 +25,10 @@ class Peer:
             if pybullet.loadPlugin(plugin.origin, "_eglRendererPlugin") < 0:
                 raise RuntimeError("pybullet's EGL plugin does not load")
             self.kind = pybullet.ER_BULLET_HARDWARE_OPENGL
-        self.description = f"pybullet {pybullet.getAPIVersion()}, {backend}"
+        self.description = (
+            f"texture under its light, depth, ids; panorama: {CONVERTED}; "
+            f"pybullet {pybullet.getAPIVersion()}, {backend}"
+        )
         with tempfile.TemporaryDirectory() as folder:
             self._load(arrays, Path(folder))
         self.cubemap = Cubemap()

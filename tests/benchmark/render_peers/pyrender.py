@@ -5,14 +5,17 @@ import numpy as np
 import pyrender
 from PIL import Image
 
-from render_peers.cubemap import FACE, Cubemap
+from render_peers.cubemap import CONVERTED, FACE, Cubemap
 
 
 class Peer:
     """One pass for colour and depth (flat shading), a second for segmentation."""
 
     def __init__(self, arrays):
-        self.description = f"pyrender {pyrender.__version__}, EGL"
+        self.description = (
+            f"texture without light, depth and ids in two passes, back faces left out; panorama: {CONVERTED}; "
+            f"pyrender {pyrender.__version__}, EGL"
+        )
         self.scene = pyrender.Scene(bg_color=[0.8, 0.85, 0.9, 1])
         texture = pyrender.Texture(source=Image.fromarray(arrays.atlas), source_channels="RGB")
         material = pyrender.MetallicRoughnessMaterial(baseColorTexture=texture)

@@ -4,6 +4,8 @@ from __future__ import annotations
 import numpy as np
 from render_scene import to_scene
 
+from render_peers.cubemap import CONVERTED
+
 
 class Peer:
     """Ours; the instruction set comes from WIW_ISA."""
@@ -11,8 +13,9 @@ class Peer:
     def __init__(self, arrays, backend="cpu"):
         from wiw.render import Renderer
 
+        how = "by rays" if backend == "cpu" else CONVERTED
         self.renderer = Renderer(to_scene(arrays), backend)
-        self.description = self.renderer.description
+        self.description = f"texture, lightmap, depth, ids; panorama: {how}; {self.renderer.description}"
         self.views = self._buffers((480, 480))
         self.panoramas = self._buffers((576, 1024))
 
