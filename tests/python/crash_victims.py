@@ -3,11 +3,15 @@
 
 On its standard input the server reads a job a line, JSON {"what", "out", "kill_after", ...}; it kills the victim after
 so many seconds, or lets it end where none are given, and answers [exit code (negative: the signal), what went wrong].
+A job's "limits" are of the operating system, by their names in `resource`. Its "fault" is [number of the call that
+fails, of those that write below the folder "below", 0 for none; way], for servers that have loaded `failing_writes.c`;
+a victim that ends well answers with the number of such calls.
 """
 
 from __future__ import annotations
 
 import contextlib
+import ctypes
 import importlib
 import json
 import os
@@ -20,15 +24,30 @@ from pathlib import Path
 
 HERE = Path(__file__).parent
 EPISODES = 8
+FAULTS = ("full", "input/output error", "torn", "killed in the middle")
+"""Ways in which a write fails, numbered as in `failing_writes.c`."""
+
+
+def build_faults(folder):
+    """Compile what makes writes fail; return the library."""
+    library = folder / "failing_writes.so"
+    command = ["cc", "-O1", "-shared", "-fPIC", "-o", library, HERE / "failing_writes.c", "-ldl"]
+    subprocess.run(command, check=True)
+    return library
 
 
 class Victims:
     """The test's side."""
 
-    def __init__(self):
-        environment = {**os.environ, "PYTHONPATH": os.pathsep.join([str(HERE), *sys.path]), "OPENBLAS_NUM_THREADS": "1"}
+    def __init__(self, faults=None, imports=(), **environment):
+        own = {"PYTHONPATH": os.pathsep.join([str(HERE), *sys.path]), "OPENBLAS_NUM_THREADS": "1"}
+        own |= {} if faults is None else {"LD_PRELOAD": str(faults)}
         self._server = subprocess.Popen(
-            [sys.executable, __file__], stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True, env=environment
+            [sys.executable, __file__, *imports],
+            stdin=subprocess.PIPE,
+            stdout=subprocess.PIPE,
+            text=True,
+            env={**os.environ, **own, **environment},
         )
         assert self._line() == "ready"
 
@@ -86,7 +105,36 @@ def export(out, target, kind, **_):
         log.export(**{kind: target})
 
 
-WORK = {"evaluate": evaluate, "report": report, "export": export}
+def merge(out, parts, scratch, **_):
+    import wiw
+
+    wiw.merge(parts, out, scratch)
+
+
+def collect(out, scene, **_):
+    from wiw.training.collect_navigation import collect_navigation
+
+    rules = {"min_samples": 4, "spacing": 3.0, "leaf_ratio": 0.5}
+    collect_navigation(out, scene, rules=rules, size=(18, 32), seed=3, backend="cpu", lossless=True)
+
+
+def train(out, **_):
+    import torch
+    from test_train_navigator import SMALL, marked_places
+
+    from wiw.policies.navigator import weights
+    from wiw.training import navigator
+    from wiw.training.checkpoint import Checkpoint
+
+    torch.set_num_threads(1)
+    target = Path(out) / "weights.safetensors"
+    checkpoint = Checkpoint(target.with_suffix(".checkpoint"), {"recipe": vars(SMALL)}, seconds=0)
+    network, recipe = navigator.train([marked_places(12)], SMALL, checkpoint=checkpoint)
+    weights.save(target, network, vars(recipe))
+    checkpoint.remove()
+
+
+WORK = {function.__name__: function for function in (evaluate, report, export, merge, collect, train)}
 IMPORTS = (
     *("fakes", "wiw.loop.scheduler", "wiw.studies.evaluate"),
     *("wiw.report.export", "wiw.report.page", "wiw.report.site", "wiw.report.recording"),
@@ -97,8 +145,11 @@ IMPORTS = (
 
 def live(job, said):
     """The victim's whole life; what went wrong goes to the pipe `said`."""
-    if "most_bytes" in job:
-        resource.setrlimit(resource.RLIMIT_FSIZE, (job["most_bytes"],) * 2)
+    for name, most in job.get("limits", {}).items():
+        resource.setrlimit(getattr(resource, name), (most,) * 2)
+    if "fault" in job:
+        number, way = job["fault"]
+        ctypes.CDLL(None).fail_write(os.fsencode(job["below"]), number, FAULTS.index(way))
     imported = set(sys.modules)
     try:
         WORK[job["what"]](**job)
@@ -108,6 +159,8 @@ def live(job, said):
     except BaseException as error:
         os.write(said, f"{type(error).__name__}: {error}".encode())
         os._exit(1)
+    if "fault" in job:
+        os.write(said, str(ctypes.CDLL(None).count_writes()).encode())
     os._exit(0)
 
 
@@ -115,7 +168,7 @@ def serve():
     import cv2
 
     cv2.setNumThreads(1)
-    for name in IMPORTS:
+    for name in (*IMPORTS, *sys.argv[1:]):
         with contextlib.suppress(ModuleNotFoundError):  # of an extra
             importlib.import_module(name)
 

@@ -23,7 +23,8 @@ from wiw.files import atomic_file, atomic_folder
 from wiw.runs.store import RunStore, store_path
 from wiw.studies.run_log import load_run
 
-KILLS_OF_RUNS, KILLS_OF_SHARDS, KILLS_OF_EXPORTS = 140, 10, 60
+KILLS = [(40, 6, 30), pytest.param((1500, 200, 300), marks=[pytest.mark.nightly, pytest.mark.timeout(7200)])]
+"""Of runs, of each shard, and of exports: 82 for every change, 2,200 nightly."""
 HERE = Path(__file__).parent
 
 
@@ -64,10 +65,11 @@ def seconds(victims, what, out, **options):
     return time.monotonic() - begin
 
 
-def test_runs_killed_at_random_moments_lose_no_ended_episode(victims, reference, tmp_path):
+@pytest.mark.parametrize("kills_of", KILLS)
+def test_runs_killed_at_random_moments_lose_no_ended_episode(victims, reference, tmp_path, kills_of):
     expected, draw, kills, runs = facts(reference), random.Random(0), 0, 0
     whole_time = max(seconds(victims, "evaluate", tmp_path / f"warm{i}") for i in range(2))
-    while kills < KILLS_OF_RUNS:
+    while kills < kills_of[0]:
         out, reported = tmp_path / f"run{runs}", tmp_path / f"reported{runs}"
         runs, left, here = runs + 1, 1.0, 0
         while here < 7:
@@ -83,15 +85,16 @@ def test_runs_killed_at_random_moments_lose_no_ended_episode(victims, reference,
         assert victims.run("evaluate", out) == 0
         assert facts(out) == expected
         shutil.rmtree(out, ignore_errors=True)
-    assert runs >= KILLS_OF_RUNS / 7
+    assert runs >= kills_of[0] / 7
 
 
-def test_shards_killed_at_random_moments_are_merged_into_the_run_of_one_process(victims, reference, tmp_path):
+@pytest.mark.parametrize("kills_of", KILLS)
+def test_shards_killed_at_random_moments_are_merged_into_the_run_of_one_process(victims, reference, tmp_path, kills_of):
     """One shard writes in its own folder, the other on a disk of its own that is copied after each episode."""
     draw, kills, parts = random.Random(2), 0, [{"shard": "1/2"}, {"shard": "2/2", "scratch": str(tmp_path / "disk")}]
     whole_time = seconds(victims, "evaluate", tmp_path / "warm", **parts[1])
     for number, part in enumerate(parts):
-        for _ in range(KILLS_OF_SHARDS):
+        for _ in range(kills_of[1]):
             kills += (
                 victims.run("evaluate", tmp_path / f"run/{number}", kill_after=draw.uniform(0, whole_time), **part) != 0
             )
@@ -112,13 +115,14 @@ def kinds():
     return found | ({"rerun": "run.rrd"} if importlib.util.find_spec("rerun") else {})
 
 
-def test_exports_killed_at_random_moments_leave_all_or_nothing(victims, reference, tmp_path):
+@pytest.mark.parametrize("kills_of", KILLS)
+def test_exports_killed_at_random_moments_leave_all_or_nothing(victims, reference, tmp_path, kills_of):
     before, draw, kills = store_path(reference).read_bytes(), random.Random(1), dict.fromkeys(kinds(), 0)
     for kind, name in kinds().items():
         whole_copy = tmp_path / f"whole-{name}"
         most = seconds(victims, "export", reference, kind=kind, target=str(whole_copy))
         expected, target, tries = contents(whole_copy), tmp_path / kind / name, 0
-        while kills[kind] < KILLS_OF_EXPORTS / len(kinds()):
+        while kills[kind] < kills_of[2] / len(kinds()):
             after = draw.uniform(0, most)
             if victims.run("export", reference, kind=kind, target=str(target), kill_after=after) == 0:
                 most *= 0.9
@@ -128,7 +132,7 @@ def test_exports_killed_at_random_moments_leave_all_or_nothing(victims, referenc
                 assert same(kind, contents(target), expected)
                 shutil.rmtree(target) if target.is_dir() else target.unlink()
             tries += 1
-            assert tries < 200
+            assert tries < 200 + kills_of[2]
         assert victims.run("export", reference, kind=kind, target=str(target)) == 0
         assert [path.name for path in target.parent.iterdir()] == [name]  # what the killed had begun is swept away
     assert store_path(reference).read_bytes() == before
@@ -148,12 +152,14 @@ def test_a_disk_that_is_full_sooner_or_later_is_said_and_mended(victims, tmp_pat
     evaluate(tmp_path / "whole", **small)
     expected, told = facts(tmp_path / "whole"), set()
     out, enough = tmp_path / "run", 8
-    while victims.run("evaluate", out, **small, most_bytes=4096 * enough) != 0:  # the log grows beyond the store
+    while (
+        victims.run("evaluate", out, **small, limits={"RLIMIT_FSIZE": 4096 * enough}) != 0
+    ):  # the log grows beyond the store
         shutil.rmtree(out, ignore_errors=True)
         enough *= 2
     shutil.rmtree(out, ignore_errors=True)
     for page in sorted({0, 1, 2, *np.linspace(3, enough, 16).astype(int).tolist()}):
-        if victims.run("evaluate", out, **small, most_bytes=4096 * page) == 0:
+        if victims.run("evaluate", out, **small, limits={"RLIMIT_FSIZE": 4096 * page}) == 0:
             shutil.rmtree(out, ignore_errors=True)
             continue
         assert victims.said.startswith("StoreError: ") and str(out) in victims.said and "make room" in victims.said
@@ -186,7 +192,7 @@ def test_a_full_disk_leaves_what_was_written_before_readable(victims, tmp_path):
 
 def test_a_report_that_does_not_fit_leaves_the_old_one(victims, reference, tmp_path):
     (tmp_path / "report.html").write_text("old")
-    assert victims.run("report", reference, target=str(tmp_path / "report.html"), most_bytes=8192) == 1
+    assert victims.run("report", reference, target=str(tmp_path / "report.html"), limits={"RLIMIT_FSIZE": 8192}) == 1
     assert victims.said.startswith("FileError: ") and "report.html: cannot be written" in victims.said
     assert [path.name for path in tmp_path.iterdir()] == ["report.html"]
     assert (tmp_path / "report.html").read_text() == "old"

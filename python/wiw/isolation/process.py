@@ -123,10 +123,13 @@ class ChildProcess:
 
     def _start(self) -> None:
         self.kill()
-        ours, theirs = socket.socketpair(socket.AF_UNIX, socket.SOCK_STREAM)
-        command = [sys.executable, "-m", "wiw.isolation.child", str(theirs.fileno()), str(os.getpid())]
-        with theirs:
-            process = _starter().submit(_open, command, theirs.fileno()).result()
+        try:
+            ours, theirs = socket.socketpair(socket.AF_UNIX, socket.SOCK_STREAM)
+            command = [sys.executable, "-m", "wiw.isolation.child", str(theirs.fileno()), str(os.getpid())]
+            with theirs:
+                process = _starter().submit(_open, command, theirs.fileno()).result()
+        except OSError as error:  # out of descriptors or processes
+            raise InfrastructureError(f"a model's process could not start: {error}") from error
         self._process, self._connection = process, ours
         self._end = weakref.finalize(self, _end, process, ours)
         try:

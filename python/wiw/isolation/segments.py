@@ -33,7 +33,10 @@ class Segment:
 
     def __init__(self, name: int, size: int) -> None:
         self.name, self.size = name, size
-        self.descriptor = os.memfd_create("wiw", os.MFD_CLOEXEC | os.MFD_ALLOW_SEALING)
+        try:
+            self.descriptor = os.memfd_create("wiw", os.MFD_CLOEXEC | os.MFD_ALLOW_SEALING)
+        except OSError as error:
+            raise InfrastructureError(f"no descriptor for memory to share with a model's process: {error}") from error
         try:
             os.posix_fallocate(self.descriptor, 0, size)  # now, with an error: later it would be a signal
             fcntl.fcntl(self.descriptor, fcntl.F_ADD_SEALS, SEALS)

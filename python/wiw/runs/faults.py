@@ -15,20 +15,25 @@ _DAMAGED = ("malformed", "not a database", "no such table", "no such column", "u
 
 
 @contextmanager
-def explain_faults(path: Path) -> Iterator[None]:
-    """Turn an error of SQLite about the run store at `path` into a `StoreError` that says what to do."""
+def explain_faults(path: Path, home: Path | None = None) -> Iterator[None]:
+    """Turn an error of SQLite about the run store at `path` into a `StoreError` that says what to do.
+
+    Args:
+        path: the file that is written or read.
+        home: the file in the run's own folder, where `path` is another.
+    """
     try:
         yield
     except sqlite3.DatabaseError as error:
-        raise StoreError(f"{path}: {error}; {find_remedy(path, str(error))}") from error
+        raise StoreError(f"{path}: {error}; {find_remedy(path, str(error), home)}") from error
 
 
-def find_remedy(path: Path, error: str) -> str:
+def find_remedy(path: Path, error: str, home: Path | None = None) -> str:
     """Return what was expected of the run store at `path` and what to do, given the text of an SQLite error."""
     if any(words in error for words in _UNWRITTEN):
         return (
             f"expected free space, and the right to write, in {path.parent}. What was recorded before is kept: "
-            f"make room, then `wiw resume {path.parent}`"
+            f"make room, then `wiw resume {(home or path).parent}`"
         )
     if any(words in error for words in _DAMAGED):
         return (

@@ -7,7 +7,6 @@ and `calls` as far as they depend on which episodes were live together, and what
 
 from __future__ import annotations
 
-import tempfile
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import ExitStack
 from dataclasses import asdict, dataclass
@@ -21,7 +20,7 @@ from wiw.runs.execute import draw_pictures, read_recipes
 from wiw.runs.pictures import drop_spare_pictures
 from wiw.runs.rows import to_json
 from wiw.runs.run import find_stores
-from wiw.runs.scratch import find_local_folder
+from wiw.runs.scratch import make_local_folder
 from wiw.runs.store import RunStore
 from wiw.runs.verify import list_differences, read_facts
 from wiw.world_models.base import Requirements
@@ -88,15 +87,13 @@ def merge(stores: Sequence[str | Path], out: str | Path, scratch: str | Path | N
         ArgumentError: no folder is given.
         StoreError: no store; manifests that differ, naming the difference; unlike records of an episode for which equal
             ones are promised; `out` holds a run already.
-        FileError: `out` cannot be written.
+        FileError: `out` or `scratch` cannot be written.
     """
     with ExitStack() as stack:
         parts = [stack.enter_context(RunStore.read(folder)) for folder in find_stores(stores)]
         require_equal_manifests(parts)
         takes, repeated, unlike = _choose_sources(parts)
-        own = find_local_folder() if scratch is None else Path(scratch)
-        own.mkdir(parents=True, exist_ok=True)
-        local = stack.enter_context(tempfile.TemporaryDirectory(prefix="wiw-merge-", dir=own))
+        local = stack.enter_context(make_local_folder(scratch))
         created = min(part.created for part in parts)
         target = RunStore.create(out, parts[0].config, _merge_info(parts), parts[0].episodes(), local, created)
         try:

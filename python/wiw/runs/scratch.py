@@ -13,11 +13,14 @@ import shutil
 import sqlite3
 import tempfile
 import time
-from contextlib import closing, suppress
+from collections.abc import Iterator
+from contextlib import closing, contextmanager, suppress
 from hashlib import blake2b
 from pathlib import Path
 
+from wiw.errors import FileError
 from wiw.files import atomic_file
+from wiw.runs.faults import explain_faults
 
 PERIOD = 60.0
 """Seconds between two copies."""
@@ -38,12 +41,15 @@ class ScratchCopy:
         """Fetch the store from its home, unless a killed process has left more of the same run here.
 
         The caller holds the store's lock.
+
+        Raises:
+            StoreError: the store at home cannot be read, or the one here cannot be written.
         """
-        with closing(_open(self.home, "ro")) as source:
+        with explain_faults(self.home), closing(_open(self.home, "ro")) as source:
             if self._has_left_more(source):
                 return
             self.discard()
-            with closing(sqlite3.connect(self.path)) as target:
+            with explain_faults(self.path, self.home), closing(sqlite3.connect(self.path)) as target:
                 source.backup(target)
 
     def copy_if_due(self, connection: sqlite3.Connection) -> None:
@@ -55,10 +61,12 @@ class ScratchCopy:
         """Copy the store home.
 
         Raises:
-            FileError: it cannot be written; the store here is whole.
+            StoreError: there is no room for a second file here.
+            FileError: it cannot be written at home; the store here is whole.
         """
         draft = self.path.with_name(f"{self.path.name}.copy")
-        write_whole(connection, draft)
+        with explain_faults(draft, self.home):
+            write_whole(connection, draft)
         with atomic_file(self.home) as file:
             shutil.copyfile(draft, file)
         draft.unlink()
@@ -90,6 +98,26 @@ class ScratchCopy:
 def find_local_folder() -> Path:
     """Return where temporary files belong: the folder of the SLURM job where the cluster makes one, else $TMPDIR."""
     return Path(os.environ.get("SLURM_TMPDIR") or tempfile.gettempdir())
+
+
+@contextmanager
+def make_local_folder(parent: str | Path | None) -> Iterator[Path]:
+    """Yield a new folder that is removed at the end, in `parent`, else where temporary files belong.
+
+    Raises:
+        FileError: it cannot be made.
+    """
+    own = find_local_folder() if parent is None else Path(parent)
+    try:
+        own.mkdir(parents=True, exist_ok=True)
+        folder = tempfile.TemporaryDirectory(prefix="wiw-", dir=own)
+    except OSError as error:
+        raise FileError(
+            f"{own}: no folder can be made there ({error.strerror}); expected a local disk with free space and the "
+            "right to write: make room or name another with --scratch (scratch=)"
+        ) from error
+    with folder as path:
+        yield Path(path)
 
 
 def write_whole(connection: sqlite3.Connection, path: Path) -> None:

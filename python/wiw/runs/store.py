@@ -218,8 +218,7 @@ class RunStore:
         """Open a store for writing on a local disk."""
         lock = _lock_both(copy)
         try:
-            with explain_faults(copy.home):
-                copy.take_in()
+            copy.take_in()
         except BaseException:
             lock.close()
             raise
@@ -678,7 +677,7 @@ class RunStore:
 
     @contextmanager
     def _writing(self) -> Iterator[sqlite3.Connection]:
-        with explain_faults(self.path), self._connection as connection:
+        with explain_faults(self.path, self.home), self._connection as connection:
             connection.execute("BEGIN IMMEDIATE")
             yield connection
 
@@ -747,7 +746,8 @@ def _make_folder(path: Path) -> None:
         path.parent.mkdir(parents=True, exist_ok=True)
     except OSError as error:
         raise StoreError(
-            f"cannot make the run's folder {path.parent}: {error}; choose another with out= or --out"
+            f"cannot make the run's folder {path.parent} ({error.strerror}); expected free space and the right to "
+            "write there: make room, or choose another with out= or --out"
         ) from error
 
 

@@ -94,7 +94,10 @@ def open_folder(folder: Path, config: Mapping[str, Any], read: Callable[[Path], 
             with atomic_file(folder / MANIFEST) as draft:
                 draft.write_text(json.dumps(config, indent=2) + "\n")
     except OSError as error:
-        raise FileError(f"{folder}: cannot be written ({error.strerror}); name another folder with --out") from error
+        raise FileError(
+            f"{folder}: cannot be written ({error.strerror}); expected a folder with free space and the right to "
+            "write: make room or name another with --out"
+        ) from error
     before = read(folder)
     if differing := [name for name in {**config, **before} if before.get(name) != config.get(name)]:
         said = ", ".join(f"{name} {before.get(name)} there and {config.get(name)} asked" for name in differing)
