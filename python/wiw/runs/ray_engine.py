@@ -12,15 +12,14 @@ from __future__ import annotations
 import os
 import queue
 import secrets
-import signal
 from collections import deque
 from collections.abc import Iterable, Iterator, Mapping
 from concurrent.futures import ThreadPoolExecutor
-from contextlib import contextmanager
 from dataclasses import dataclass, field, replace
 from typing import Any
 
-from wiw.errors import DependencyError, InfrastructureError, RemoteError, VlmError
+from wiw.errors import InfrastructureError, RemoteError, VlmError
+from wiw.ray_cluster import connect_cluster, import_ray
 from wiw.runs.config import EngineConfig
 from wiw.runs.ray_servers import START_SECONDS as SERVER_SECONDS
 from wiw.runs.ray_servers import LostServersError, ServerPool
@@ -43,8 +42,6 @@ TRIES = 3
 """How often an episode is begun whose actor, or whose server, is lost."""
 UNREACHABLE = ("connection", "unreachable")
 """Kinds of errors that say that a server was lost, of world models and of language models."""
-STORE_BYTES = 200_000_000
-"""Memory of a local cluster's object store: rows are small, and containers often have 64 MB of shared memory."""
 START_SECONDS = 600.0
 """Time that the cluster has for giving an actor its resources."""
 
@@ -99,9 +96,9 @@ def run_on_ray(
         InfrastructureError: the cluster cannot be reached or has not the resources, or task or agents cannot be sent.
         Error: what an actor raised on purpose, such as a broken contract.
     """
-    ray = _import_ray()
+    import_ray()
     pickle_spec(spec)  # what cannot be sent is said before a cluster is started
-    with _connect(ray, config):
+    with connect_cluster(config.address) as ray:
         pool = _ActorPool(ray, spec, deque(jobs), receiver, workers, config)
         try:
             pool.run()
@@ -280,50 +277,3 @@ class _ActorPool:
         if lease.job is None:
             raise InfrastructureError(f"an actor of Ray could not start: {error}") from error
         self._jobs.extend(lease_again(lease.job, lease.unfinished, self._receiver, TRIES, cause))
-
-
-@contextmanager
-def _connect(ray: Any, config: EngineConfig) -> Iterator[None]:
-    """Connect to a cluster, or start one of this machine, for as long as the context lasts.
-
-    Raises:
-        InfrastructureError: there is no cluster at the address.
-    """
-    if ray.is_initialized():
-        yield
-        return
-    handler = signal.getsignal(signal.SIGTERM)
-    own: dict[str, Any] = {"address": config.address}
-    if config.address is None:
-        os.environ.setdefault("RAY_USAGE_STATS_ENABLED", "0")  # Ray would report to its makers
-        own |= {"num_cpus": len(os.sched_getaffinity(0)), "object_store_memory": STORE_BYTES}  # in a SLURM job: its own
-        own |= {"include_dashboard": False}
-    try:
-        ray.init(**own, log_to_driver=False, logging_level="error")
-    except (ConnectionError, ValueError, RuntimeError, OSError) as error:
-        raise InfrastructureError(
-            f"no Ray cluster at {config.address or 'this machine'}: {error}; expected an address of "
-            "`ray start --head`, such as auto or HOST:6379, or none for a cluster of this machine alone"
-        ) from error
-    try:
-        _restore(handler)
-        yield
-    finally:
-        ray.shutdown()
-        _restore(handler)
-
-
-def _restore(handler: Any) -> None:
-    """Put back the handler of SIGTERM, which Ray replaces: a run that is stopped is closed in order."""
-    try:
-        signal.signal(signal.SIGTERM, handler)
-    except ValueError:  # not in the main thread, where Ray replaces none
-        return
-
-
-def _import_ray() -> Any:
-    try:
-        import ray
-    except ModuleNotFoundError:
-        raise DependencyError("engine ray needs ray: pip install 'wiw[ray]'") from None
-    return ray
