@@ -33,6 +33,7 @@ FACES = {
     "suggestions",
     "networks",
     "process_limits",
+    "ray_cluster",
     "panorama",
     "scenes",
     "render",

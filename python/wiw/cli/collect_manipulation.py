@@ -12,6 +12,7 @@ from tyro.conf import arg
 
 from wiw.cli.bars import Bars
 from wiw.cli.stop import announce_resume
+from wiw.ray_cluster import HERE, Engine
 
 
 def collect_manipulation(
@@ -27,6 +28,7 @@ def collect_manipulation(
     keep_failed: bool = False,
     backend: Literal["auto", "cpu", "gpu"] = "auto",
     workers: Annotated[int, arg(metavar="N")] = 1,
+    place: Annotated[Engine, arg(name="")] = HERE,
 ) -> int:
     """Collect demonstrations of the manipulation tasks as training data, in Parquet files.
 
@@ -50,6 +52,7 @@ def collect_manipulation(
         keep_failed: Whether to keep failed demonstrations, too; otherwise another table replaces theirs.
         backend: Renderer; pictures differ a little between them.
         workers: Processes; the files are the same for any number of them.
+        place: Where they are; with engine ray, --out is a folder that all machines of the cluster see.
     """
     from wiw.training.collect import collect
 
@@ -57,7 +60,9 @@ def collect_manipulation(
     what_of_it = {"episodes": episodes, "seed": seed, "keep_failed": keep_failed}
     how_seen = {"size": size, "frames": frames, "format": format, "depth": depth, "backend": backend}
     with announce_resume(), Bars() as bars:
-        made = collect(out, tasks, workers=workers, progress=partial(_show, bars), **what_of_it, **how_seen)
+        made = collect(
+            out, tasks, workers=workers, place=place, progress=partial(_show, bars), **what_of_it, **how_seen
+        )
     megabytes = sum(path.stat().st_size for path in out.glob("*.parquet")) / 2**20
     failed = sum(made.failed.values())
     print(

@@ -14,6 +14,7 @@ from tyro.conf import arg
 from wiw.cli.bars import Bars
 from wiw.cli.options import Options
 from wiw.cli.stop import announce_resume
+from wiw.ray_cluster import HERE, Engine
 
 
 def collect_navigation(
@@ -31,6 +32,7 @@ def collect_navigation(
     rule: Options = (),
     backend: Literal["auto", "cpu", "gpu"] = "auto",
     workers: Annotated[int, arg(metavar="N")] = 1,
+    place: Annotated[Engine, arg(name="")] = HERE,
     skip_errors: bool = False,
     dry_run: bool = False,
 ) -> int:
@@ -65,6 +67,7 @@ def collect_navigation(
             `wiw.training.navigation_rules.NavigationRules`.
         backend: Renderer; pictures differ a little between them.
         workers: Processes; the files are the same for any number of them.
+        place: Where they are; with engine ray, --out is a folder that all machines of the cluster see.
         skip_errors: Whether to leave out scenes that cannot be opened; otherwise they are an error at the end.
         dry_run: Whether to plan only, and to print how many frames, hours and gigabytes it would be.
     """
@@ -80,7 +83,7 @@ def collect_navigation(
     began = time.monotonic()
     with announce_resume(), Bars() as bars:
         data = collect_navigation(
-            out, scenes, workers=workers, skip_errors=skip_errors, progress=partial(_show, bars), **options
+            out, scenes, workers=workers, place=place, skip_errors=skip_errors, progress=partial(_show, bars), **options
         )
     totals = data.meta["totals"]
     print(

@@ -8,6 +8,8 @@ from typing import Annotated
 
 from tyro.conf import Positional, UseAppendAction, arg
 
+from wiw.ray_cluster import HERE, Engine
+
 
 def quality(
     runs: Positional[Annotated[tuple[Path, ...], arg(metavar="RUN [RUN ...]")]],
@@ -19,6 +21,8 @@ def quality(
     lpips: Annotated[str | None, arg(metavar="auto|FOLDER")] = None,
     out: Annotated[Path | None, arg(metavar="FOLDER")] = None,
     deadline: Annotated[float, arg(metavar="SECONDS")] = 300.0,
+    workers: Annotated[int, arg(metavar="N")] = 1,
+    place: Annotated[Engine, arg(name="")] = HERE,
 ) -> int:
     """Does looking better help more? Visual quality and controllability of imagined frames, against success.
 
@@ -52,13 +56,18 @@ def quality(
         lpips: Weights of LPIPS (see `wiw run --lpips`); SSIM alone if not given.
         out: Where to write; quality in the first run's folder if not given.
         deadline: Seconds that a scorer may be silent.
+        workers: Actors of Ray that score frames, each with scorers of its own.
+        place: Where frames are scored.
     """
     from wiw.cli.bars import Bars
     from wiw.studies.quality import quality as score
 
     names = None if arms is None else [name.strip() for name in arms.split(",") if name.strip()]
     with Bars() as bars:
-        found = score(runs, scorer, frames=frames, arms=names, lpips=lpips, out=out, deadline=deadline, watch=bars.show)
+        found = score(
+            runs, scorer, frames=frames, arms=names, lpips=lpips, out=out, deadline=deadline, workers=workers,
+            place=place, watch=bars.show,
+        )  # fmt: skip
     found.summary()
     for path in found.save():
         print(path)

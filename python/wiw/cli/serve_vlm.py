@@ -3,18 +3,26 @@
 
 from __future__ import annotations
 
+import os
+from contextlib import ExitStack
+from pathlib import Path
 from typing import Annotated, Any
 
 from tyro.conf import arg
+
+from wiw.wire.address_book import ServerAddress, announce_server
 
 
 def serve_vlm(
     *,
     model: Annotated[str, arg(metavar="tiny|mock|PATH|FILE.py:FUNCTION")] = "tiny",
+    host: Annotated[str, arg(metavar="ADDRESS")] = "127.0.0.1",
     port: Annotated[int, arg(metavar="N")] = 8000,
+    token: Annotated[str | None, arg(metavar="SECRET")] = None,
+    announce: Annotated[Path | None, arg(metavar="FILE")] = None,
     seed: Annotated[int, arg(metavar="N")] = 0,
 ) -> int:
-    """Serve a vision-language model on this machine, with the API of OpenAI and vLLM, for tests.
+    """Serve a vision-language model, with the API of OpenAI and vLLM, for tests.
 
       $ wiw serve-vlm
       $ wiw serve-vlm --model my_script.py:answer --port 8001
@@ -24,23 +32,28 @@ def serve_vlm(
     Args:
         model: tiny, a model with random weights, built on the spot; mock, with random answers; a folder or hub name for
             transformers; or a function that takes each call and returns text, or a probability for each first token.
-        port: Port on 127.0.0.1; 0 picks a free one.
+        host: Address to listen on; any but the loopback address requires a token.
+        port: Port to listen on; 0 picks a free one.
+        token: Secret that clients must send as OPENAI_API_KEY; WIW_TOKEN if not given.
+        announce: File (.json) in which to announce address and token as long as it serves.
         seed: Seed of the random weights.
     """
     import tempfile
 
     from wiw.serving.vlm_server import VlmServer
 
-    with tempfile.TemporaryDirectory() as folder:
-        server = VlmServer(_client(model, seed, folder), port)
+    secret = token or os.environ.get("WIW_TOKEN")
+    with tempfile.TemporaryDirectory() as folder, ExitStack() as announcing:
+        server = VlmServer(_client(model, seed, folder), port, host, secret)
         print(f"{server.client.model} at {server.url}", flush=True)
+        if announce is not None:
+            announcing.enter_context(announce_server(ServerAddress(server.url, secret), announce))
         server.serve()
     return 0
 
 
 def _client(model: str, seed: int, folder: str) -> Any:
     from hashlib import blake2b
-    from pathlib import Path
 
     from wiw.registry import Registry
     from wiw.vlm.mock import MockClient

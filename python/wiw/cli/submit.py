@@ -3,6 +3,7 @@
 
 from __future__ import annotations
 
+import math
 import shlex
 from dataclasses import replace
 from pathlib import Path
@@ -32,8 +33,6 @@ def submit(
     /,
     *,
     shards: Annotated[int, arg(metavar="N")] = 8,
-    servers: Annotated[int, arg(metavar="N")] = 0,
-    server_gpus: Annotated[int, arg(metavar="N")] = 1,
     server_partition: Annotated[str | None, arg(metavar="NAME")] = None,
     jobs: Annotated[ClusterConfig, arg(name="")] = CLUSTER,
     dry_run: bool = False,
@@ -61,10 +60,8 @@ def submit(
     Args:
         task: See `wiw list`.
         shards: Number of parts of the episodes, each a job.
-        servers: Jobs of their own that serve --world-model to all shards; none, and each shard has its own model, if
-            not given. A server ends after half an hour without a client.
-        server_gpus: GPUs of such a job.
-        server_partition: Its SLURM partition; --partition if not given.
+        server_partition: SLURM partition of the jobs of --servers; --partition if not given. A server ends after half
+            an hour without a client.
         jobs: What a job asks of the cluster.
         dry_run: Whether to print the commands and submit nothing.
         parts: The agent.
@@ -78,10 +75,12 @@ def submit(
     for name in ("shard", "resume"):
         if getattr(config, name):
             raise ArgumentError(f"submit: --{name} is what each job is given; leave it out")
+    if config.served is not None:
+        raise ArgumentError("submit: --servers serve --world-model; --served is for --engine ray")
     prepared = prepare_run(task, parts, arms, rules, search, replace(config, salt=_find_salt(config)))
     folder, count = Path(prepared.settings.out or ""), prepared.count
     Shard(1, shards).select(count)
-    serving = _write_servers(folder, parts, servers, jobs.cluster)
+    serving = _write_servers(folder, parts, config.servers, jobs.cluster)
     if serving:
         parts, arms = replace(parts, world_model=_remote(folder), world_model_option=()), _ask_servers(prepared, folder)
     parted = [Shard(number, shards) for number in range(1, shards + 1)]
@@ -93,7 +92,7 @@ def submit(
         print(shlex.join(["wiw", *command]))
     if left and not dry_run:
         name = f"wiw-{folder.name}"
-        own = replace(jobs, gpus=server_gpus, partition=server_partition or jobs.partition)
+        own = replace(jobs, gpus=math.ceil(config.server_gpus), partition=server_partition or jobs.partition)
         begun = submit_commands(folder, absent, own, f"{name}-server") if absent else []
         submitted = submit_commands(folder, left, jobs, name, begun)
         print(f"\njobs    {submitted[0].id} to {submitted[-1].id}, output in {folder / 'jobs'}")
@@ -135,6 +134,8 @@ def _write_command(
     """Return the command of a shard as arguments of `wiw`."""
     own = replace(
         settings,
+        servers=SETTINGS.servers,
+        server_gpus=SETTINGS.server_gpus,
         shard=str(shard),
         out=Path(settings.out or "") / shard.folder,
         scratch=settings.scratch or "auto",

@@ -15,7 +15,9 @@ from tyro.conf import Positional, arg
 from wiw.cli.options import Options
 from wiw.cli.stop import announce_resume
 from wiw.cli.train_pocket import train_pocket
-from wiw.cli.train_video import RUN_AS, VIDEO, TrackerName, VideoName, train_video
+from wiw.cli.train_video import RUN_AS, VIDEO, TrackerName, VideoName, encode_video, train_video
+from wiw.errors import ArgumentError
+from wiw.ray_cluster import HERE, Engine
 from wiw.training.launcher import ProcessLayout, require_single_process
 
 ONE_PROCESS = ProcessLayout()
@@ -36,7 +38,9 @@ USES: Mapping[str, tuple[tuple[str, ...], str]] = {
     "categories": (("recogniser",), "has no categories"),
     "plays": (ON_PLAYS, "does not train on plays"),
     "demonstrations": (ON_DEMONSTRATIONS, "does not train on demonstrations"),
-    "workers": ((*ON_SCENES, *ON_PLAYS), "prepares its data in one process"),
+    "workers": ((*ON_SCENES, *ON_PLAYS, *VIDEO), "prepares its data in one process"),
+    "encode-only": (VIDEO, "has no frozen networks that encode clips"),
+    "engine": (VIDEO, "prepares its data on this machine"),
     "cache": ((*ON_SCENES, *ON_PLAYS, *ON_DATA), "caches no training data"),
     "minutes": ((*ON_SCENES, *ON_PLAYS, "diffuser"), "has no time limit, but --option clips=N"),
     "data": (ON_DATA, "trains on other data"),
@@ -86,6 +90,8 @@ def train(
     seed: Annotated[int, arg(metavar="N")] = 0,
     workers: Annotated[int | None, arg(metavar="N")] = None,
     cache: Annotated[Path | None, arg(metavar="DIR")] = None,
+    encode_only: bool = False,
+    place: Annotated[Engine, arg(name="")] = HERE,
     layout: Annotated[ProcessLayout, arg(name="")] = ONE_PROCESS,
     dry_run: bool = False,
 ) -> int:
@@ -124,6 +130,8 @@ def train(
     $ wiw train ltx-action --data data --out runs/ltx
     $ wiw train wan2.1-action --data data --weights /models/wan2.1 --option clips=1600 --option lora=16 --out runs/wan
     $ wiw train ltx-action --data data --gpus 8 --out runs/ltx
+    $ wiw train ltx-action --data data --cache latents --encode-only --engine ray --workers 8 --worker-gpus 1
+    $ wiw train ltx-action --data data --cache latents --out runs/ltx
     $ wiw train wan2.2-5b-action --data data --option shard=true --nodes 2 --gpus 8 --partition gpu --out runs/wan5b
     $ wiw run imagenav --world-model ltx-action --world-model-option checkpoint=runs/ltx
     $ wiw train nwm-action --data data --out runs/nwm
@@ -182,9 +190,12 @@ def train(
             (default: 24, and up to three near each), or walks recorded in each scene, for warpnet (default: 24).
         plays: Simulated plays of armnet, of eight gripper poses each. Default: 2000.
         seed: Seed of the training data and of the weights.
-        workers: Processes that prepare training data from scenes or plays. Default: 2.
+        workers: Processes that prepare training data from scenes or plays, or with engine ray encode clips. Default: 2,
+            for video models 1.
         cache: Folder of prepared training data; it can be deleted at any time. Default: $WIW_CACHE/looks. Of clips as
             a video model's frozen networks encode them, for later epochs and other trainings. Default: none.
+        encode_only: Encode the clips of a video model's training into --cache, and train nothing.
+        place: Where the processes of --encode-only are; with engine ray, all machines see --data and --cache.
         layout: Processes of a video model's training.
         dry_run: Print the command that runs on each machine, for several GPUs, and train nothing.
     """
@@ -203,11 +214,17 @@ def train(
     options |= {"validation": validation, "decisions": decisions, "tracker": tracker}
     options |= {"gpus": None if layout.gpus == 1 else layout.gpus, "nodes": None if layout.nodes == 1 else layout.nodes}
     options |= {"partition": layout.partition, "dry-run": dry_run or None}
+    options |= {"encode-only": encode_only or None, "engine": None if place == HERE else place.engine}
     _check_use(what, _drop_none(options))
+    if what in VIDEO and encode_only:
+        numbers = _drop_none({"epochs": epochs, "seed": seed or None})
+        given: dict[str, Any] = {"weights": weights, "device": device, "part": part or "train"}
+        return encode_video(what, data, cache, recipe, option, numbers, given, workers or 1, place)
     if what in VIDEO:
+        _require_no_encoding(workers, place)
         _require_torch(what)
         numbers = _drop_none({"epochs": epochs, "seed": seed or None})
-        given: dict[str, Any] = {"weights": weights, "device": device, "part": part or "train", "cache": cache}
+        given = {"weights": weights, "device": device, "part": part or "train", "cache": cache}
         given |= {"validation": validation, "decisions": decisions, "tracker": tracker}
         return train_video(what, out or Path(what), data, recipe, option, numbers, given, layout, dry_run)
     require_single_process(what, "run the command without torchrun")  # each would train alike and write the same file
@@ -243,6 +260,11 @@ def train(
             _train_warpnet(out, source, minutes, rules, lengths)
     print(f"weights   {out} ({out.stat().st_size / 2**20:.2f} MB)")
     return 0
+
+
+def _require_no_encoding(workers: int | None, place: Engine) -> None:
+    if workers is not None or place != HERE:
+        raise ArgumentError("train: --workers and --engine are for --encode-only; --gpus is for training")
 
 
 @dataclass(frozen=True)
@@ -496,8 +518,6 @@ def _check_numbers(
     workers: int | None,
 ) -> None:
     """Refuse numbers that are out of range."""
-    from wiw.errors import ArgumentError
-
     counts = {"epochs": epochs, "places": places, "plays": plays, "workers": workers}
     for name, count in _drop_none(counts).items():
         if count < 1:
@@ -510,8 +530,6 @@ def _check_numbers(
 
 def _check_use(what: str, given: Mapping[str, Any]) -> None:
     """Refuse options that the network does not use."""
-    from wiw.errors import ArgumentError
-
     for name in given:
         users, reason = USES[name]
         if what not in users:

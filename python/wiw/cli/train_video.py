@@ -12,6 +12,8 @@ from typing import TYPE_CHECKING, Any, Literal, get_args
 
 from wiw.cli.bars import Bars
 from wiw.cli.stop import announce_resume
+from wiw.errors import ArgumentError
+from wiw.ray_cluster import Engine
 from wiw.training.launcher import ProcessLayout
 
 if TYPE_CHECKING:
@@ -96,6 +98,38 @@ def _train(name: str, data: Path, out: Path, recipe: PostTrainingRecipe, weights
     return 0
 
 
+def encode_video(
+    name: str,
+    data: Path | None,
+    cache: Path | None,
+    recipe: Path | None,
+    pairs: Sequence[str],
+    numbers: Mapping[str, Any],
+    weights: Mapping[str, Any],
+    workers: int,
+    place: Engine,
+) -> int:
+    """Encode the clips of a model's training into a folder; arguments as of `train_video`.
+
+    Raises:
+        ArgumentError: no data or no folder; see also `wiw.training.post_training.encode_clips.encode_clips`.
+    """
+    from wiw.training.post_training.encode_clips import encode_clips
+
+    folder = require_data(name, data, " or `wiw collect manipulation`")
+    if cache is None:
+        raise ArgumentError("train: --encode-only writes encoded clips into a folder: name it with --cache")
+    chosen, began = _choose_recipe(name, recipe, pairs, numbers, weights), time.monotonic()
+    with announce_resume(), Bars() as bars:
+
+        def show(done: int, total: int) -> None:
+            bars.show("clips", done, total, f"{done}/{total}")
+
+        count = encode_clips(name, folder, cache, recipe=chosen, workers=workers, place=place, progress=show, **weights)
+    print(f"{count:,} clips encoded in {time.monotonic() - began:.0f} s: {cache}")
+    return 0
+
+
 def _launch(
     arguments: Sequence[str], recipe: PostTrainingRecipe, layout: ProcessLayout, out: Path, dry_run: bool
 ) -> int:
@@ -149,8 +183,6 @@ def require_data(name: str, data: Path | None, also: str = "") -> Path:
     Raises:
         ArgumentError: there is none.
     """
-    from wiw.errors import ArgumentError
-
     if data is None:
         raise ArgumentError(f"{name} trains on a dataset; give a folder of `wiw collect navigation`{also} by --data")
     return data

@@ -12,20 +12,26 @@ from tyro.conf import arg
 
 from wiw.errors import ArgumentError
 from wiw.loop.limits import Limits
+from wiw.ray_cluster import Engine
 from wiw.runs.shards import Shard
 from wiw.types import check_seed
 
 
 @dataclass(frozen=True, kw_only=True)
-class EngineConfig:
-    """The engine that runs the episodes, and its place."""
+class EngineConfig(Engine):
+    """The engine that runs the episodes, its place, and the servers of its own."""
 
-    engine: Literal["processes", "ray"] = "processes"
-    """processes of this machine, or ray: actors of a Ray cluster, of which --workers is the number."""
-    address: Annotated[str | None, arg(metavar="ADDRESS")] = None
-    """Ray cluster, such as auto or HOST:6379; one of this machine alone if not given."""
-    worker_gpus: Annotated[float, arg(metavar="N")] = 0
-    """GPUs of an actor of Ray."""
+    servers: Annotated[int, arg(metavar="N")] = 0
+    """Servers of --world-model that all workers ask: actors of Ray, or jobs of `wiw submit`; none, and each worker has
+    its own model, if not given."""
+    server_gpus: Annotated[float, arg(metavar="N")] = 1
+    """GPUs of such a server."""
+    served: Annotated[str | None, arg(metavar="MODEL")] = None
+    """World model of --arms that actors of Ray serve; --world-model if not given."""
+    vlm_servers: Annotated[int, arg(metavar="N")] = 0
+    """Servers of --vlm transformers:PATH (or mock), as actors of Ray; worker by worker they are taken in turn."""
+    vlm_server_gpus: Annotated[float, arg(metavar="N")] = 1
+    """GPUs of such a server."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -79,10 +85,12 @@ class RunConfig(Limits, EngineConfig):
                 raise ArgumentError(f"evaluate: expected {name} of at least {least}, got {value}")
         if self.seed is not None:
             check_seed(self.seed)
-        if self.worker_gpus < 0:
-            raise ArgumentError(f"evaluate: expected worker_gpus of at least 0, got {self.worker_gpus}")
-        if self.engine != "ray" and (self.address is not None or self.worker_gpus):
-            raise ArgumentError("evaluate: address and worker_gpus are for engine ray: give --engine ray (engine=)")
+        self.require_valid("evaluate")
+        for name in ("servers", "server_gpus", "vlm_servers", "vlm_server_gpus"):
+            if getattr(self, name) < 0:
+                raise ArgumentError(f"evaluate: expected {name} of at least 0, got {getattr(self, name)}")
+        if self.engine != "ray" and self.vlm_servers:
+            raise ArgumentError("evaluate: vlm_servers are for engine ray: give --engine ray (engine=)")
         if self.shard is not None:
             Shard.parse(self.shard)
         if self.until is not None and self.episodes is None:

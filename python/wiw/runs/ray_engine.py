@@ -3,24 +3,28 @@
 
 An actor is a worker as in `workers.py`: it builds task and agents from recipes, leases one job at a time and sends its
 rows as they come. Ray tells when an actor, its process or its node is lost; what the job had not finished is then
-leased again, one episode at a time, at most `TRIES` times. No object of Ray's gets into the results.
+leased again, one episode at a time, at most `TRIES` times. So is an episode that a lost server of the run
+(`ray_servers.py`) has cost. No object of Ray's gets into the results.
 """
 
 from __future__ import annotations
 
 import os
 import queue
-import signal
+import secrets
 from collections import deque
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterable, Iterator, Mapping
 from concurrent.futures import ThreadPoolExecutor
-from contextlib import contextmanager
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Any
 
-from wiw.errors import DependencyError, InfrastructureError
+from wiw.errors import InfrastructureError, RemoteError, VlmError
+from wiw.ray_cluster import connect_cluster, import_ray
 from wiw.runs.config import EngineConfig
+from wiw.runs.ray_servers import START_SECONDS as SERVER_SECONDS
+from wiw.runs.ray_servers import LostServersError, ServerPool
 from wiw.runs.rows import OutcomeRow
+from wiw.runs.servers import ask_servers, find_served, write_commands, write_vlm_commands
 from wiw.runs.workers import (
     Job,
     ReportReceiver,
@@ -32,12 +36,12 @@ from wiw.runs.workers import (
     pickle_spec,
     unpickle_spec,
 )
-from wiw.types import Episode
+from wiw.types import Episode, EpisodeResult
 
 TRIES = 3
-"""How often an episode is begun whose actor is lost."""
-STORE_BYTES = 200_000_000
-"""Memory of a local cluster's object store: rows are small, and containers often have 64 MB of shared memory."""
+"""How often an episode is begun whose actor, or whose server, is lost."""
+UNREACHABLE = ("connection", "unreachable")
+"""Kinds of errors that say that a server was lost, of world models and of language models."""
 START_SECONDS = 600.0
 """Time that the cluster has for giving an actor its resources."""
 
@@ -92,10 +96,10 @@ def run_on_ray(
         InfrastructureError: the cluster cannot be reached or has not the resources, or task or agents cannot be sent.
         Error: what an actor raised on purpose, such as a broken contract.
     """
-    ray = _import_ray()
-    data = pickle_spec(spec)
-    with _connect(ray, config):
-        pool = _ActorPool(ray, data, deque(jobs), receiver, workers, config)
+    import_ray()
+    pickle_spec(spec)  # what cannot be sent is said before a cluster is started
+    with connect_cluster(config.address) as ray:
+        pool = _ActorPool(ray, spec, deque(jobs), receiver, workers, config)
         try:
             pool.run()
         finally:
@@ -103,50 +107,102 @@ def run_on_ray(
 
 
 class _ActorPool:
-    """The driver's side: leases jobs to actors, receives rows, and replaces actors that are lost."""
+    """The driver's side: leases jobs to actors, receives rows, and replaces actors and servers that are lost."""
 
     def __init__(
-        self, ray: Any, spec: bytes, jobs: deque[Job], receiver: ReportReceiver, size: int, config: EngineConfig
+        self, ray: Any, spec: WorkerSpec, jobs: deque[Job], receiver: ReportReceiver, size: int, config: EngineConfig
     ) -> None:
         self._ray, self._spec, self._jobs, self._receiver = ray, spec, jobs, receiver
-        self._size, self._gpus = min(size, len(jobs)), config.worker_gpus
+        self._size, self._config = min(size, len(jobs)), config
         self._leases: list[_Lease] = []
+        self._begun = 0
+        """Actors so far."""
+        self._token = secrets.token_urlsafe()
+        is_alone = config.address is None and len(ray.nodes()) == 1
+        host = "127.0.0.1" if is_alone else None
+        commands = write_commands(spec.task.build(), spec.agents, config) if config.servers else []
+        self._models = ServerPool(ray, commands, host, self._token)
+        self._vlms = ServerPool(ray, write_vlm_commands(spec.agents, config), host, self._token)
+        self._addresses: tuple[list[str], list[str]] = ([], [])
+        """Where the servers were when the actors began: of world models, and of language models."""
 
     def run(self) -> None:
-        while self._jobs or any(lease.job for lease in self._leases):
-            for lease in self._leases:
-                if lease.rows is None and self._jobs:  # had nothing to do until another one was lost
-                    self._assign(lease)
-            while len(self._leases) < self._size and self._jobs:
-                self._leases.append(self._start())
-            ready, _ = self._ray.wait([lease.rows for lease in self._leases if lease.rows], timeout=START_SECONDS)
-            if not ready and not any(lease.job for lease in self._leases):
-                raise InfrastructureError(
-                    f"no actor could be started within {START_SECONDS:g} s: expected a Ray cluster with a free core"
-                    f"{f' and {self._gpus:g} GPUs' if self._gpus else ''} for an actor; see `ray status`"
-                )
-            for lease in [lease for lease in self._leases if lease.rows in ready]:
-                self._receive(lease)
+        for pool in (self._models, self._vlms):
+            pool.start()
+        try:
+            while self._jobs or any(lease.job for lease in self._leases):
+                if self._models.serves and self._vlms.serves:
+                    self._place_jobs()
+                self._await_news()
+        except LostServersError as error:
+            self._record_lost(str(error))
+            raise
+
+    def _place_jobs(self) -> None:
+        """Start actors and lease jobs to those that have none; begin with new actors where a server has moved."""
+        if (now := (self._models.addresses, self._vlms.addresses)) != self._addresses:
+            self._withdraw_jobs()
+            self._addresses = now
+        for lease in self._leases:
+            if lease.rows is None and self._jobs:
+                self._assign(lease)
+        while len(self._leases) < self._size and self._jobs:
+            self._leases.append(self._start())
+
+    def _await_news(self) -> None:
+        """Wait for rows, starts and losses, and deal with what has come."""
+        servers = [*self._models.refs, *self._vlms.refs]
+        waiting = [*(lease.rows for lease in self._leases if lease.rows), *servers]
+        serves = self._models.serves and self._vlms.serves
+        ready, _ = self._ray.wait(waiting, timeout=START_SECONDS if serves else SERVER_SECONDS + START_SECONDS)
+        if not ready and not any(lease.job for lease in self._leases):
+            raise InfrastructureError(self._describe_shortage(serves))
+        for pool in (self._models, self._vlms):
+            pool.tend(ready)
+        for lease in [lease for lease in self._leases if lease.rows in ready]:
+            self._receive(lease)
+
+    def _describe_shortage(self, serves: bool) -> str:
+        config = self._config
+        what, seconds = ("actor", START_SECONDS) if serves else ("server", SERVER_SECONDS + START_SECONDS)
+        gpus = config.worker_gpus if serves else max(config.server_gpus, config.vlm_server_gpus)
+        return (
+            f"no {what} could be started within {seconds:g} s: expected a Ray cluster with a free core"
+            f"{f' and {gpus:g} GPUs' if gpus else ''} for each; see `ray status`"
+        )
 
     def stop(self) -> None:
         for lease in self._leases:
             self._ray.kill(lease.actor)
+        for pool in (self._models, self._vlms):
+            pool.stop()
 
     def _start(self) -> _Lease:
         threads = max(1, len(os.sched_getaffinity(0)) // self._size)
-        kind = self._ray.remote(num_cpus=1, num_gpus=self._gpus, max_restarts=0, max_task_retries=0)(EpisodeActor)
-        actor = kind.remote(self._spec, threads)
+        gpus = self._config.worker_gpus
+        kind = self._ray.remote(num_cpus=1, num_gpus=gpus, max_restarts=0, max_task_retries=0)(EpisodeActor)
+        actor = kind.remote(self._pickle_spec(), threads)
+        self._begun += 1
         return _Lease(actor, rows=actor.prepare.remote())
+
+    def _pickle_spec(self) -> bytes:
+        """Return what the next actor needs: all of the world model's servers, and one of the language model's."""
+        models, vlms = self._addresses
+        if not models and not vlms:
+            return pickle_spec(self._spec)
+        served = find_served(self._spec.agents, self._config.served).model if models else None
+        vlm = vlms[self._begun % len(vlms)] if vlms else None
+        return pickle_spec(replace(self._spec, agents=ask_servers(self._spec.agents, served, models, vlm, self._token)))
 
     def _receive(self, lease: _Lease) -> None:
         try:
             if lease.job is None:
                 self._ray.get(lease.rows)
-                self._assign(lease)
+                lease.rows = None
                 return
             row = self._ray.get(next(lease.rows))
         except StopIteration:
-            self._assign(lease)
+            lease.job, lease.rows = None, None
             return
         except self._ray.exceptions.RayActorError as error:
             self._replace(lease, error)
@@ -154,17 +210,61 @@ class _ActorPool:
         except self._ray.exceptions.RayTaskError as error:
             raise InfrastructureError(f"an actor of Ray failed: {error}") from error
         if isinstance(row, Exception):
-            raise row
+            if not self._may_try_again(lease.job, row):
+                raise row
+            self._lease_again(lease, lease.unfinished)
+        elif isinstance(row, OutcomeRow):
+            self._receive_outcome(lease, row)
+        else:
+            self._receiver.write(row)
+
+    def _receive_outcome(self, lease: _Lease, row: OutcomeRow) -> None:
+        """Write an outcome; an episode that a lost server has cost is run again while it has tries left."""
+        result = row.result
+        if lease.job is not None and self._may_try_again(lease.job, result):
+            self._lease_again(lease, {result.episode: lease.unfinished[result.episode]})
+            return
         self._receiver.write(row)
-        if isinstance(row, OutcomeRow):
-            lease.unfinished.pop(row.result.episode, None)
+        lease.unfinished.pop(result.episode, None)
+        if result.status == "done":
+            self._models.note_progress()
+            self._vlms.note_progress()
+
+    def _may_try_again(self, job: Job, error: Exception | EpisodeResult) -> bool:
+        """Return whether an error is a lost server's, and the job has tries left."""
+        told = isinstance(error, EpisodeResult | RemoteError | VlmError) and error.kind in UNREACHABLE
+        return told and bool(len(self._models) or len(self._vlms)) and job.attempt + 1 < TRIES
+
+    def _lease_again(self, lease: _Lease, episodes: Mapping[int, Episode]) -> None:
+        """Take episodes from a lease to run them again, by any actor."""
+        assert lease.job is not None
+        cause = "its server was lost"
+        self._jobs.extend(lease_again(lease.job, dict(episodes), self._receiver, TRIES, cause))
+        lease.unfinished = {index: own for index, own in lease.unfinished.items() if index not in episodes}
+
+    def _withdraw_jobs(self) -> None:
+        """End all actors; what they have not finished is run by others, and this is no try of theirs."""
+        for lease in self._leases:
+            self._ray.kill(lease.actor)
+            if lease.job is not None and lease.unfinished:
+                self._receiver.discard(lease.job.arm, list(lease.unfinished))
+                self._jobs.appendleft(replace(lease.job, episodes=tuple(lease.unfinished.items())))
+        self._leases = []
+
+    def _record_lost(self, cause: str) -> None:
+        """Record the episodes that were live as errors: one of them may be what ends the servers."""
+        for job, unfinished in [(lease.job, lease.unfinished) for lease in self._leases]:
+            if job is None:
+                continue
+            self._receiver.discard(job.arm, list(unfinished))
+            for index, episode in list(unfinished.items())[: self._spec.live]:
+                result = EpisodeResult(index, episode.episode_id, episode.scene, "error", error=cause, kind="server")
+                self._receiver.write(OutcomeRow(job.arm, result))
 
     def _assign(self, lease: _Lease) -> None:
-        lease.job, lease.rows = None, None
-        if self._jobs:
-            lease.job = self._jobs.popleft()
-            lease.unfinished = dict(lease.job.episodes)
-            lease.rows = lease.actor.run.options(num_returns="streaming").remote(lease.job)
+        lease.job = self._jobs.popleft()
+        lease.unfinished = dict(lease.job.episodes)
+        lease.rows = lease.actor.run.options(num_returns="streaming").remote(lease.job)
 
     def _replace(self, lease: _Lease, error: Exception) -> None:
         """Lease the unfinished episodes of a lost actor again, or record them as errors.
@@ -177,50 +277,3 @@ class _ActorPool:
         if lease.job is None:
             raise InfrastructureError(f"an actor of Ray could not start: {error}") from error
         self._jobs.extend(lease_again(lease.job, lease.unfinished, self._receiver, TRIES, cause))
-
-
-@contextmanager
-def _connect(ray: Any, config: EngineConfig) -> Iterator[None]:
-    """Connect to a cluster, or start one of this machine, for as long as the context lasts.
-
-    Raises:
-        InfrastructureError: there is no cluster at the address.
-    """
-    if ray.is_initialized():
-        yield
-        return
-    handler = signal.getsignal(signal.SIGTERM)
-    own: dict[str, Any] = {"address": config.address}
-    if config.address is None:
-        os.environ.setdefault("RAY_USAGE_STATS_ENABLED", "0")  # Ray would report to its makers
-        own |= {"num_cpus": len(os.sched_getaffinity(0)), "object_store_memory": STORE_BYTES}  # in a SLURM job: its own
-        own |= {"include_dashboard": False}
-    try:
-        ray.init(**own, log_to_driver=False, logging_level="error")
-    except (ConnectionError, ValueError, RuntimeError, OSError) as error:
-        raise InfrastructureError(
-            f"no Ray cluster at {config.address or 'this machine'}: {error}; expected an address of "
-            "`ray start --head`, such as auto or HOST:6379, or none for a cluster of this machine alone"
-        ) from error
-    try:
-        _restore(handler)
-        yield
-    finally:
-        ray.shutdown()
-        _restore(handler)
-
-
-def _restore(handler: Any) -> None:
-    """Put back the handler of SIGTERM, which Ray replaces: a run that is stopped is closed in order."""
-    try:
-        signal.signal(signal.SIGTERM, handler)
-    except ValueError:  # not in the main thread, where Ray replaces none
-        return
-
-
-def _import_ray() -> Any:
-    try:
-        import ray
-    except ModuleNotFoundError:
-        raise DependencyError("engine ray needs ray: pip install 'wiw[ray]'") from None
-    return ray

@@ -107,7 +107,7 @@ class AgentRecipe(AgentConfig):
 
     def build(self, context: RunContext, limits: Limits = NO_LIMITS) -> Agent:
         """Return the agent; numbers that are open are the task's."""
-        space = self._find_space(context.task)
+        space = self.find_space(context.task)
         model: Any = self.model
         if options := self.resolve_model_options(context.task):
             model = make_for_space(self.model, space, limits.deadline, **options)
@@ -222,11 +222,11 @@ class AgentRecipe(AgentConfig):
                 "tracker for task ar alone"
             )
         if self.placebo is not None:
-            require_placebo(self.placebo, self._find_space(task), episodes)
+            require_placebo(self.placebo, self.find_space(task), episodes)
         if self.placebo == "blind" and (control := find_control(self.model)):
             require_words(control)
         if self.error is not None:
-            require_error(make_error(self.error), self._find_space(task), _has_simulator(self.model))
+            require_error(make_error(self.error), self.find_space(task), _has_simulator(self.model))
         parts = ((WORLD_MODELS, self.model), (POLICIES, self.policy), (POLICIES, self.reviser))
         for registry, part in parts:
             found = registry.find(part) if isinstance(part, str) else part
@@ -255,7 +255,8 @@ class AgentRecipe(AgentConfig):
         hosts = ";".join(address.partition("://")[2] for address in self.model.split(","))
         return f"{kind.partition(':')[0]}:{hosts}" if scheme else self.model.rpartition(":")[2]
 
-    def _find_space(self, task: Task) -> str:
+    def find_space(self, task: Task) -> str:
+        """Return the plan space: the agent's own, or the task's."""
         return self.space or task.defaults.get("space") or PRIMITIVES
 
     def _make_policies(self, space: str, task: Task) -> tuple[Any, Any]:

@@ -90,7 +90,7 @@ class Settings:
                 "serve: expected a port below 65536, a queue of at least 1, and a window and a grace of at least 0, "
                 f"got port={self.port}, queue={self.queue}, window={self.window}, grace={self.grace}"
             )
-        if not self.token and not _is_loopback(self.host):
+        if not self.token and not is_loopback(self.host):
             raise ArgumentError(
                 f"serve: {self.host} can be reached by others than this machine: set WIW_TOKEN (or --token) to a "
                 "secret that clients show, such as the output of `openssl rand -hex 16`"
@@ -385,7 +385,8 @@ def _sources(model: WorldModel, fingerprint: str) -> dict[str, Any]:
     return {"sources": {Path(path).name: digest for path, digest in digests.items()}} if digests else {}
 
 
-def _is_loopback(host: str) -> bool:
+def is_loopback(host: str) -> bool:
+    """Return whether an address to listen on is of this machine alone."""
     try:
         return ipaddress.ip_address(host).is_loopback
     except ValueError:

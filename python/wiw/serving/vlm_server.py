@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""A small OpenAI-compatible server of chat completions on the loopback interface, with any `Client` behind it.
+"""A small OpenAI-compatible server of chat completions, with any `Client` behind it.
 
 It speaks log-probabilities, images as data URIs, JSON schemas, choices and usage, as far as `wiw` and its tests ask for
 them.
@@ -7,6 +7,7 @@ them.
 
 from __future__ import annotations
 
+import hmac
 import json
 import threading
 import time
@@ -16,6 +17,7 @@ from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
 from typing import Any
 
 from wiw.errors import ArgumentError, Error
+from wiw.serving.server import is_loopback
 from wiw.vlm.base import Client
 from wiw.vlm.images import from_data_uri
 from wiw.vlm.messages import Call, Completion, Message, Part
@@ -36,29 +38,40 @@ class Response:
 
 
 class VlmServer:
-    """Serves on 127.0.0.1 from `start` to `stop`; works as a context manager.
+    """Serves from `start` to `stop`; works as a context manager.
 
     Args:
         client: answers the completions.
         port: 0 takes a free one; see `url`.
+        host: address to listen on.
+        token: secret that clients must send, as OpenAI's API key; required unless `host` is a loopback address.
+
+    Raises:
+        ArgumentError: it cannot listen there, or others than this machine could ask it without a token.
     """
 
-    def __init__(self, client: Client, port: int = 0) -> None:
-        self.client = client
+    def __init__(self, client: Client, port: int = 0, host: str = "127.0.0.1", token: str | None = None) -> None:
+        if token is None and not is_loopback(host):
+            raise ArgumentError(
+                f"serve-vlm: {host} can be reached by others than this machine: set WIW_TOKEN (or --token) to a secret "
+                "that clients send as OPENAI_API_KEY, such as the output of `openssl rand -hex 16`"
+            )
+        self.client, self.token = client, token
         self.requests: list[dict[str, Any]] = []
         """Bodies of the latest 1000 requests, without their images' data."""
         self.count = 0
         self._asking, self._counting = threading.Lock(), threading.Lock()
         try:
-            self._http = _Http(("127.0.0.1", port), _Handler)
+            self._http = _Http((host, port), _Handler)
         except (OSError, OverflowError) as error:
             raise ArgumentError(f"serve-vlm: cannot listen on port {port}: {error}; choose another --port") from None
+        self._host = host
         self._http.server = self
 
     @property
     def url(self) -> str:
         """Address for clients, as in "http://127.0.0.1:8000/v1"."""
-        return f"http://127.0.0.1:{self._http.server_address[1]}/v1"
+        return f"http://{self._host}:{self._http.server_address[1]}/v1"
 
     def start(self) -> VlmServer:
         """Serve in a thread."""
@@ -117,6 +130,8 @@ class _Handler(BaseHTTPRequestHandler):
 
     def do_GET(self) -> None:
         server: VlmServer = self.server.server  # type: ignore[attr-defined]
+        if not self._is_welcome(server.token):
+            return
         if self.path.rstrip("/") == "/v1/models":
             models = [{"id": server.client.model, "object": "model", "created": 0, "owned_by": "wiw"}]
             self._send(200, {"object": "list", "data": models})
@@ -130,6 +145,8 @@ class _Handler(BaseHTTPRequestHandler):
         if self.headers.get("origin"):  # a browser names the page that asks; no page has business here
             self.close_connection = True
             self._send(403, _error("web pages are not answered"))
+            return
+        if not self._is_welcome(server.token):
             return
         declared = self.headers.get("content-length", "")
         if not declared.isdecimal():
@@ -147,6 +164,15 @@ class _Handler(BaseHTTPRequestHandler):
             self._send(response.status, response.body, response.headers)
         except Exception as error:
             self._send(400 if isinstance(error, UNCLEAR) else 500, _error(f"{type(error).__name__}: {error}"))
+
+    def _is_welcome(self, token: str | None) -> bool:
+        """Return whether a client has sent the server's secret, if it has one; refuse it otherwise."""
+        shown = self.headers.get("authorization", "").encode("latin-1", "replace")
+        if token is None or hmac.compare_digest(shown, f"Bearer {token}".encode()):
+            return True
+        self.close_connection = True
+        self._send(401, _error("the server's token is expected as API key"))
+        return False
 
     def _send(self, status: int, body: Mapping[str, Any], headers: Mapping[str, str] | None = None) -> None:
         data = json.dumps(body).encode()

@@ -6,7 +6,7 @@ from __future__ import annotations
 import sys
 import time
 from collections.abc import Mapping, Sequence
-from dataclasses import asdict, fields
+from dataclasses import asdict, fields, replace
 from datetime import datetime
 from pathlib import Path
 from typing import Any
@@ -21,7 +21,8 @@ from wiw.runs.departures import describe_departures
 from wiw.runs.execute import read_recipes, require_left, require_own_sources, run_pending, sources_of
 from wiw.runs.pictures import pool_episodes
 from wiw.runs.platform import describe_platform
-from wiw.runs.recipes import TaskInMemory, TaskRecipe, agent_recipe, arm_recipes, task_recipe
+from wiw.runs.recipes import AgentRecipe, TaskInMemory, TaskRecipe, agent_recipe, arm_recipes, task_recipe
+from wiw.runs.servers import require_servable
 from wiw.runs.shards import Shard
 from wiw.runs.store import RunStore, remove_if_empty
 from wiw.studies.run_log import RunLog
@@ -66,6 +67,8 @@ def evaluate(
         WeightsError: those of LPIPS are not there; says which, and how to get them.
     """
     own, task_options = take_settings(config, settings, episodes)
+    if own.servers and own.served is None:
+        own = replace(own, served=_find_model_name(agent))
     return _run(_find_task(env_or_task, task_options, own), arm_recipes(agent, arms), own)
 
 
@@ -81,6 +84,12 @@ def run_arms(
     own, task_options = take_settings(config, settings, episodes)
     recipes = {name: agent_recipe(agent) for name, agent in agents.items()}
     return _run(_find_task(env_or_task, task_options, own), recipes, own)
+
+
+def _find_model_name(agent: Any) -> str | None:
+    """Return the name of an agent's world model; None where it has none, or an object."""
+    recipe = agent_recipe(agent)
+    return recipe.model if isinstance(recipe, AgentRecipe) and isinstance(recipe.model, str) else None
 
 
 def _find_task(env_or_task: Any, options: dict[str, Any], settings: RunConfig) -> TaskRecipe | TaskInMemory:
@@ -126,6 +135,8 @@ def resume_run(
         place = EngineConfig(**{**store.info.get("engine", {}), **given})
         if place.engine != "ray" and given.get("address") is not None:
             raise ArgumentError("resume: address is for engine ray: give --engine ray (engine=) as well")
+        if place.engine != "ray":  # each worker has its own model then
+            place = EngineConfig(engine=place.engine)
         if "attributes" in store.config:
             own, whole = store.path.parent, store.path.parent.parent
             raise StoreError(f"{own} holds the reruns of `wiw blame {whole}`; resume them by that command")
@@ -143,6 +154,7 @@ def resume_run(
 
 
 def _run(task: Any, agents: Mapping[str, Any], settings: RunConfig) -> RunLog:
+    require_servable(agents, settings.place)
     if settings.lpips is not None:
         Lpips(settings.lpips)  # report missing weights before anything is run
     built = task.build()

@@ -9,6 +9,7 @@ same frames for all arms, as the run's store keeps them.
 from __future__ import annotations
 
 import json
+import math
 import tempfile
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import ExitStack, contextmanager
@@ -31,10 +32,11 @@ from wiw.analysis.quality import (
 )
 from wiw.analysis.summary import split_outcomes
 from wiw.analysis.utility import CEILING
-from wiw.errors import ArgumentError, FileError
+from wiw.errors import ArgumentError, FileError, ScorerError
 from wiw.metrics import Lpips, ssim
 from wiw.metrics.metric import ANSWER_SCORE, SUCCESS, Metric
 from wiw.panorama import to_perspective
+from wiw.ray_cluster import HERE, Engine, map_batches
 from wiw.runs.frame_scores import FrameScores
 from wiw.runs.imagined_frames import (
     FrameKey,
@@ -58,6 +60,8 @@ ALWAYS = "pixels"
 """The scorer that needs nothing and takes no time."""
 VIEW = (128, 128)
 """Height and width of the views of a panorama that LPIPS is taken of."""
+MOST_AT_ONCE = 256
+"""Frames that an actor scores between two answers."""
 SHOWN = 6
 """Frames of each arm that the page shows."""
 
@@ -120,6 +124,8 @@ def quality(
     lpips: str | Path | None = None,
     out: str | Path | None = None,
     deadline: float = DEADLINE,
+    workers: int = 1,
+    place: Engine = HERE,
     watch: Watch | None = None,
 ) -> Quality:
     """Score imagined frames of stored runs, and compare quality and controllability with success over arms.
@@ -140,6 +146,9 @@ def quality(
         lpips: folder of the weights of LPIPS, or "auto"; controllability is 1 - LPIPS then, else SSIM.
         out: folder for `save`; `quality` in the first run's folder if not given.
         deadline: seconds that a command may be silent.
+        workers: number of actors of Ray, each with scorers of its own.
+        place: this process, or actors on a Ray cluster that score the frames; sharpness and colourfulness are computed
+            here.
         watch: called with progress.
 
     Raises:
@@ -150,6 +159,9 @@ def quality(
     """
     if frames < 1:
         raise ArgumentError(f"quality: expected frames of at least 1, got {frames}")
+    place.require_valid("quality")
+    if workers < 1 or (workers > 1 and place.engine != "ray"):
+        raise ArgumentError(f"quality: expected 1 worker, or several with engine ray, got {workers}")
     given = [runs] if isinstance(runs, str | Path | RunLog) else list(runs)
     if not given:
         raise ArgumentError("quality: expected at least one run, got none")
@@ -166,7 +178,7 @@ def quality(
             arm.frames = dict(read_frames(arm.log.store, arm.places, keys))
         _find_truth(logs, chosen, keys)
         stores = {log.path: stack.enter_context(FrameScores(log.path)) for log in logs}
-        cards = _score_all([ALWAYS, *scorers], chosen, stores, deadline, watch)
+        cards = _score_all([ALWAYS, *scorers], chosen, stores, _Scoring(deadline, workers, place, watch))
         _compare_with_truth(chosen, stores, judged, watch)
         if not any(arm.true for arm in chosen):
             notes.append("No true frames, so no controllability: run with --fidelity, or with arm oracle.")
@@ -241,13 +253,23 @@ def _find_truth(logs: Sequence[RunLog], arms: Sequence[_Arm], keys: Sequence[Fra
         arm.true = {**true, **dict(read_frames(arm.log.store, arm.places, keys, "true"))}
 
 
+@dataclass(frozen=True)
+class _Scoring:
+    """How frames are scored."""
+
+    deadline: float
+    workers: int
+    place: Engine
+    watch: Watch | None
+
+
 def _score_all(
-    specs: Sequence[str], arms: Sequence[_Arm], stores: Mapping[Path, FrameScores], deadline: float, watch: Watch | None
+    specs: Sequence[str], arms: Sequence[_Arm], stores: Mapping[Path, FrameScores], scoring: _Scoring
 ) -> list[dict[str, Any]]:
     """Let each scorer score what it has not scored yet; return the cards with their commands."""
     cards: list[dict[str, Any]] = []
     for spec in dict.fromkeys(specs):
-        with make_scorer(spec, deadline) as scorer:
+        with make_scorer(spec, scoring.deadline) as scorer:
             card = scorer.card
             taken = {name for one in cards for name in one["scores"]} | {CONTROL_BY_LPIPS, CONTROL_BY_SSIM, "q"}
             if both := sorted(taken & set(card.scores)):
@@ -255,12 +277,12 @@ def _score_all(
                     f"quality: scorer '{spec}' gives {both[0]}, a name that is taken; let it give the score another one"
                 )
             cards.append({**card.as_dict(), "command": spec})
-            _score(scorer, spec, arms, stores, watch)
+            _score(scorer, spec, arms, stores, scoring)
     return cards
 
 
 def _score(
-    scorer: Scorer, spec: str, arms: Sequence[_Arm], stores: Mapping[Path, FrameScores], watch: Watch | None
+    scorer: Scorer, spec: str, arms: Sequence[_Arm], stores: Mapping[Path, FrameScores], scoring: _Scoring
 ) -> None:
     card = scorer.card
     images = {arm.digests[key]: frame for arm in arms for key, frame in arm.frames.items()}
@@ -274,8 +296,12 @@ def _score(
         for digest in homes[path] & found.keys() - known[path].keys():
             store.write(card.digest, digest, found[digest])
     missing = {digest: image for digest, image in images.items() if digest not in found}
-    for digest, scores in _ask(scorer, missing, len(images), watch):
+    remote = scoring.place.engine == "ray" and spec != ALWAYS
+    asked = _ask_actors(spec, card, missing, scoring) if remote else _ask(scorer, missing)
+    for digest, scores in asked:
         found[digest] = scores
+        if scoring.watch is not None:
+            scoring.watch(card.scorer, len(found), len(images), f"{len(found)}/{len(images)} frames")
         for path, store in stores.items():
             if digest in homes[path]:
                 store.write(card.digest, digest, scores)
@@ -284,11 +310,8 @@ def _score(
             arm.scores[name] = {key: found[digest][name] for key, digest in arm.digests.items()}
 
 
-def _ask(
-    scorer: Scorer, images: Mapping[str, Image], total: int, watch: Watch | None
-) -> Iterator[tuple[str, dict[str, float]]]:
+def _ask(scorer: Scorer, images: Mapping[str, Image]) -> Iterator[tuple[str, dict[str, float]]]:
     """Yield the scores of images by digest; they lie in a folder as PNG files meanwhile."""
-    name, done = scorer.card.scorer, total - len(images)
     with tempfile.TemporaryDirectory(prefix="wiw-quality-") as folder:
         paths = {Path(folder) / f"{digest[:32]}.png": digest for digest in images}
         for path, digest in paths.items():
@@ -299,9 +322,51 @@ def _ask(
                 )
         for path, scores in scorer.score(list(paths)):
             yield paths[path], scores
-            done += 1
-            if watch is not None:
-                watch(name, done, total, f"{done}/{total} frames")
+
+
+def _ask_actors(
+    spec: str, card: ScorerCard, images: Mapping[str, Image], scoring: _Scoring
+) -> Iterator[tuple[str, dict[str, float]]]:
+    """Yield the scores of images by digest, from actors on a Ray cluster."""
+    if not images:
+        return
+    rows = [
+        {"digest": digest, "shape": list(image.shape), "pixels": image.tobytes()} for digest, image in images.items()
+    ]
+    batch = min(MOST_AT_ONCE, math.ceil(len(rows) / scoring.workers))
+    given = {"spec": spec, "deadline": scoring.deadline, "card": card}
+    for row in map_batches(scoring.place, BatchScorer, given, rows, scoring.workers, batch):
+        yield row["digest"], json.loads(row["scores"])
+
+
+class BatchScorer:
+    """A scorer in an actor; one is made for each batch, for a command answers one list of images.
+
+    Args:
+        spec: of the scorer, as `make_scorer` takes it.
+        deadline: seconds that it may be silent.
+        card: of the scorer that has the same name where the scores are stored.
+    """
+
+    def __init__(self, spec: str, deadline: float, card: ScorerCard) -> None:
+        self._spec, self._deadline, self._card = spec, deadline, card
+
+    def __call__(self, batch: Mapping[str, Any]) -> dict[str, Any]:
+        """Return {"digest": [B], "scores": [B], as JSON} of {"digest": [B], "shape": [B, 3], "pixels": [B]}.
+
+        Raises:
+            ScorerError: no valid scores, or the scorer here is another version.
+        """
+        rows = zip(batch["digest"], batch["pixels"], batch["shape"], strict=True)
+        images = {str(digest): np.frombuffer(data, np.uint8).reshape(shape) for digest, data, shape in rows}
+        with make_scorer(self._spec, self._deadline) as scorer:
+            if scorer.card.digest != self._card.digest:
+                raise ScorerError(
+                    f"scorer '{self._spec}' is {scorer.card.label} on a machine of the cluster, expected "
+                    f"{self._card.label} as here; install the same on all"
+                )
+            found = dict(_ask(scorer, images))
+        return {"digest": list(found), "scores": [json.dumps(scores) for scores in found.values()]}
 
 
 def _compare_with_truth(

@@ -18,6 +18,7 @@ import wiw
 from wiw.datasets import shards
 from wiw.datasets.demonstrations import Demonstrations, read_manifest, shard_paths, shard_range
 from wiw.errors import ArgumentError, FileError
+from wiw.ray_cluster import HERE, Engine
 from wiw.render import resolve_backend
 from wiw.tabletop.tasks import TABLETOP_TASKS
 from wiw.tabletop.workbench import CAMERAS
@@ -33,6 +34,7 @@ def collect(
     tasks: str | Sequence[str] = "all",
     *,
     workers: int = 1,
+    place: Engine = HERE,
     progress: Progress | None = None,
     **asked: Any,
 ) -> Demonstrations:
@@ -42,6 +44,7 @@ def collect(
         out: a new folder, or one that the same call began.
         tasks: "all", or names of `wiw.tabletop.tasks.TABLETOP_TASKS`.
         workers: number of processes; the files do not depend on it.
+        place: where they are: on this machine, or tasks on a Ray cluster whose machines all see the folder.
         progress: called whenever a file is complete.
         **asked: episodes, seed, size, frames, format, depth, keep_failed, backend, as in
             `wiw.training.recording.Collection`.
@@ -56,6 +59,7 @@ def collect(
     shards.require_pyarrow()
     collection, folder, names = Collection(**asked), Path(out), _parse_tasks(tasks)
     collection = replace(collection, backend=resolve_backend(collection.backend))
+    place.require_valid("collect")
     if workers < 1:
         raise ArgumentError(f"collect: expected 1 worker or more, got {workers}")
     config = {"wiw": wiw.__version__, "tasks": names, **asdict(collection)}
@@ -71,7 +75,7 @@ def collect(
     for job, failed in before.items():
         if failed is not None:
             tally.add(job, failed)
-    for job, failed in run_jobs([job for job in jobs if before[job] is None], workers):
+    for job, failed in run_jobs([job for job in jobs if before[job] is None], workers, place):
         tally.add(job, failed)
     return Demonstrations(folder)
 

@@ -36,6 +36,7 @@ from wiw.datasets.scene_splits import find_evaluation_split, name_scene
 from wiw.datasets.worlds import World, world
 from wiw.errors import ArgumentError, BackendError, Error, FileError, InfrastructureError
 from wiw.files import atomic_file
+from wiw.ray_cluster import HERE, Engine
 from wiw.render import resolve_backend
 from wiw.scenes import resolve
 from wiw.training.jobs import open_folder, run_jobs
@@ -59,6 +60,7 @@ def collect_navigation(
     preset: str = "default",
     rules: Mapping[str, object] | None = None,
     workers: int = 1,
+    place: Engine = HERE,
     skip_errors: bool = False,
     progress: Progress | None = None,
     **asked: Any,
@@ -71,6 +73,7 @@ def collect_navigation(
         preset: "default", or "paper" (waypoints within 3 m count as visited).
         rules: fields of `wiw.training.navigation_rules.NavigationRules` to replace.
         workers: number of processes; the files do not depend on it.
+        place: where they are: on this machine, or tasks on a Ray cluster whose machines all see the folder.
         skip_errors: whether scenes that cannot be opened are left out; otherwise they are an error, once all others
             are recorded.
         progress: called whenever a pass over a scene is finished.
@@ -88,6 +91,7 @@ def collect_navigation(
     require_pyarrow("navigation datasets")
     options = NavigationCollection(rules=make_rules(preset, rules), **asked)
     options = replace(options, backend=resolve_backend(options.backend))
+    place.require_valid("collect")
     if workers < 1:
         raise ArgumentError(f"collect: expected 1 worker or more, got {workers}")
     folder, specs = Path(out), resolve_train_scenes(scenes)
@@ -99,7 +103,7 @@ def collect_navigation(
         for index in range(options.passes)
     ]
     finished = {job.number: record for job in jobs if (record := job.read_record()) is not None}
-    records, errors = _record_passes(jobs, finished, workers, progress)
+    records, errors = _record_passes(jobs, finished, workers, place, progress)
     if errors and not skip_errors:
         raise InfrastructureError(
             f"collect: {len(errors)} of {len(specs)} scenes cannot be recorded, the others are: "
@@ -112,14 +116,18 @@ def collect_navigation(
 
 
 def _record_passes(
-    jobs: Sequence[SceneJob], finished: Mapping[int, dict[str, Any]], workers: int, progress: Progress | None
+    jobs: Sequence[SceneJob],
+    finished: Mapping[int, dict[str, Any]],
+    workers: int,
+    place: Engine,
+    progress: Progress | None,
 ) -> tuple[dict[int, dict[str, Any]], dict[str, str]]:
     """Record the passes that are not finished; return the records of all by number, and errors by scene."""
     records, errors, tally = dict(finished), dict[str, str](), _Tally(len(jobs), progress)
     for job in jobs:
         if job.number in finished:
             tally.add(job.scene, finished[job.number])
-    for job, record in run_jobs([job for job in jobs if job.number not in finished], workers):
+    for job, record in run_jobs([job for job in jobs if job.number not in finished], workers, place):
         if "error" in record:
             errors[job.scene] = record["error"]
         else:

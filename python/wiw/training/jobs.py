@@ -22,6 +22,7 @@ from typing import Any, Generic, Protocol, TypeVar
 from wiw.datasets.parquet_files import MANIFEST
 from wiw.errors import ArgumentError, FileError, InfrastructureError
 from wiw.files import atomic_file, remove_abandoned_drafts
+from wiw.ray_cluster import HERE, Engine, run_tasks
 
 Result = TypeVar("Result")
 Made_co = TypeVar("Made_co", covariant=True)
@@ -34,12 +35,18 @@ class Job(Protocol, Generic[Made_co]):
         """Write the job's files."""
 
 
-def run_jobs(jobs: Sequence[Job[Result]], workers: int) -> Iterator[tuple[Any, Result]]:
+def run_jobs(jobs: Sequence[Job[Result]], workers: int, place: Engine = HERE) -> Iterator[tuple[Any, Result]]:
     """Yield jobs as they finish, with their results; with several workers each has its share of the cores.
 
+    On Ray each job is a task, and repeated where its process or node is lost.
+
     Raises:
-        InfrastructureError: a worker process has died.
+        InfrastructureError: a worker process has died, or there is no Ray cluster.
+        DependencyError: ray is not installed.
     """
+    if place.engine == "ray" and jobs:
+        yield from run_tasks(place, _run_job, jobs, workers)
+        return
     if workers == 1 or len(jobs) <= 1:
         for job in jobs:
             yield job, job.run()
@@ -59,6 +66,10 @@ def run_jobs(jobs: Sequence[Job[Result]], workers: int) -> Iterator[tuple[Any, R
     finally:
         pool.shutdown(wait=False, cancel_futures=True)
         ours.close()
+
+
+def _run_job(job: Job[Result]) -> Result:
+    return job.run()
 
 
 def _start_worker(life: Connection, threads: int) -> None:

@@ -38,7 +38,7 @@ _PASSING = (408, 409, 425, 429)
 
 
 class OpenAIClient(Client):
-    """Asks a server over HTTP; the key of one that wants any is `$OPENAI_API_KEY`.
+    """Asks a server over HTTP.
 
     Args:
         base_url: such as "http://localhost:8000/v1".
@@ -49,6 +49,7 @@ class OpenAIClient(Client):
         timeout: seconds that one request may take.
         attempts: times that it is sent in all while the server is busy or fails; how long it asks to wait is heeded.
         image_format: "png", or "jpeg" for slow connections.
+        key: the server's; None means `$OPENAI_API_KEY`.
         options: see `Client`.
     """
 
@@ -62,6 +63,7 @@ class OpenAIClient(Client):
         timeout: float = 120.0,
         attempts: int = 4,
         image_format: ImageFormat = "png",
+        key: str | None = None,
         **options: Any,
     ) -> None:
         super().__init__(**options)
@@ -75,11 +77,12 @@ class OpenAIClient(Client):
             )
         self.base_url, self.dialect, self.image_format = base_url, dialect, image_format
         self.concurrency, self.timeout, self.attempts = concurrency, timeout, attempts
-        self._model = model
+        self._model, self._key = model, key
         self._given: dict[str, Any] = {
             "model": model,
             "dialect": dialect,
             "concurrency": concurrency,
+            "key": key,
         }
         self._given |= {"timeout": timeout, "attempts": attempts, "image_format": image_format, **options}
 
@@ -134,7 +137,7 @@ class OpenAIClient(Client):
             raise DependencyError("asking OpenAI-compatible servers needs openai: pip install 'wiw[vlm]'") from None
         import os
 
-        key = os.environ.get("OPENAI_API_KEY") or "none"
+        key = self._key or os.environ.get("OPENAI_API_KEY") or "none"
         http = openai.DefaultHttpxClient(event_hooks={"response": [self._cut_off]})
         return openai.OpenAI(base_url=self.base_url, api_key=key, timeout=self.timeout, max_retries=0, http_client=http)
 

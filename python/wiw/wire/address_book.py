@@ -21,7 +21,7 @@ class ServerAddress:
     """Where a server listens."""
 
     address: str
-    """"ws://HOST:PORT", or "wss://..."."""
+    """"ws://HOST:PORT", "wss://...", or of a language model "http://HOST:PORT/v1"."""
     token: str | None = None
 
 

@@ -114,15 +114,27 @@ class PostTrainer(ClipTrainer):
 
     def _encode_clip(self, index: int, mirror: bool) -> tuple[Encoded, Tensor]:
         def make() -> tuple[Encoded, Tensor]:
-            clip = self._load_clip(index, mirror)
-            encoded = self.model.encode(clip)
-            return {name: value.contiguous() for name, value in encoded.items()}, clip.actions  # as a cache has them
+            return encode_clip(self.model, self._load_clip(index, mirror))
 
         return make() if self._cache is None else self._cache.encode(index, mirror, make, self.model.device)
 
     def _load_clip(self, index: int, mirror: bool) -> ClipBatch:
-        clip = self.clips[index]
-        return load_clips([mirror_clip(clip) if mirror else clip], self.recipe.clip_size).to(self.model.device)
+        return load_clip(self.clips, self.recipe.clip_size, index, mirror).to(self.model.device)
+
+
+def load_clip(clips: CorpusClips, size: tuple[int, int], index: int, mirror: bool) -> ClipBatch:
+    """Return a clip, or its mirror image, in a height and width, as a batch of one.
+
+    Raises:
+        FileError: it cannot be read.
+    """
+    clip = clips[index]
+    return load_clips([mirror_clip(clip) if mirror else clip], size)
+
+
+def encode_clip(model: TrainableModel, clip: ClipBatch) -> tuple[Encoded, Tensor]:
+    """Return a clip as the frozen networks encode it, and its actions, both as a cache has them."""
+    return {name: value.contiguous() for name, value in model.encode(clip).items()}, clip.actions
 
 
 def seed_weights(recipe: PostTrainingRecipe, device: torch.device) -> Any:

@@ -44,7 +44,7 @@ class Links:
             if not welcome.fingerprint:
                 raise RemoteError(
                     f"{link.address}: several servers are used only for a model that can be told from another: "
-                    f"{welcome.unknown or 'it has no version'}; give one address",
+                    f"{welcome.unknown or 'it has no version'}; give one address, or have one server",
                     "model",
                 )
             if (welcome.fingerprint, welcome.accepts) != (found[0].fingerprint, found[0].accepts):

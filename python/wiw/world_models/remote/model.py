@@ -122,6 +122,14 @@ class Remote(WorldModel):
         self._close()
 
 
+class ServedModel(Remote):
+    """A world model that the run itself serves: it describes itself as the model would in the run's own process."""
+
+    def describe(self) -> dict[str, Any]:
+        """Return what the served model says of itself, less its source files: the run's manifest has them."""
+        return {name: value for name, value in self._described.items() if name != "sources"}
+
+
 def _find_folder(address: str) -> str | None:
     """Return the folder in which servers announce themselves; None for addresses."""
     path = Path(address).expanduser()

@@ -1,0 +1,228 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Work on a Ray cluster, or on one of this machine alone: connecting to it, tasks, and batches for pools of actors.
+
+What is sent and returned are plain values; nothing of Ray's gets into results. Ray is imported when it is asked for.
+"""
+
+from __future__ import annotations
+
+import logging
+import os
+import signal
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Annotated, Any, Literal, TypeVar
+
+from tyro.conf import arg
+
+from wiw import errors
+from wiw.errors import ArgumentError, DependencyError, Error, InfrastructureError
+
+Item = TypeVar("Item")
+STORE_BYTES = 200_000_000
+"""Memory of a local cluster's object store: messages are small, and containers often have 64 MB of shared memory."""
+RETRIES = 2
+"""How often a task is repeated whose process or node is lost."""
+FAILED = "wiw error"
+"""Column of an answer of Ray Data that is an error: the name of its class; "text" is what it says."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Engine:
+    """The processes that do a job's work, and their place."""
+
+    engine: Literal["processes", "ray"] = "processes"
+    """processes of this machine, or ray: actors of a Ray cluster, of which --workers is the number."""
+    address: Annotated[str | None, arg(metavar="ADDRESS")] = None
+    """Ray cluster, such as auto or HOST:6379; one of this machine alone if not given."""
+    worker_gpus: Annotated[float, arg(metavar="N")] = 0
+    """GPUs of an actor of Ray."""
+
+    def require_valid(self, what: str) -> None:
+        """Check the numbers, and that what Ray alone has is asked of Ray; `what` is the command.
+
+        Raises:
+            ArgumentError: an address or GPUs without Ray, or a number below 0.
+        """
+        if self.worker_gpus < 0:
+            raise ArgumentError(f"{what}: expected worker_gpus of at least 0, got {self.worker_gpus}")
+        if self.engine != "ray" and (self.address is not None or self.worker_gpus):
+            raise ArgumentError(f"{what}: address and worker_gpus are for engine ray: give --engine ray (engine=)")
+
+
+HERE = Engine()
+"""Processes of this machine."""
+
+
+def import_ray() -> Any:
+    """Return the module.
+
+    Raises:
+        DependencyError: it is not installed.
+    """
+    try:
+        import ray
+    except ModuleNotFoundError:
+        raise DependencyError("engine ray needs ray: pip install 'wiw[ray]'") from None
+    return ray
+
+
+@contextmanager
+def connect_cluster(address: str | None) -> Iterator[Any]:
+    """Connect to a cluster, or start one of this machine, for as long as the context lasts; yield the module.
+
+    Raises:
+        DependencyError: ray is not installed.
+        InfrastructureError: there is no cluster at the address.
+    """
+    ray = import_ray()
+    if ray.is_initialized():
+        yield ray
+        return
+    handler = signal.getsignal(signal.SIGTERM)
+    own: dict[str, Any] = {"address": address}
+    if address is None:
+        os.environ.setdefault("RAY_USAGE_STATS_ENABLED", "0")  # Ray would report to its makers
+        own |= {"num_cpus": len(os.sched_getaffinity(0)), "object_store_memory": STORE_BYTES}  # in a SLURM job: its own
+        own |= {"include_dashboard": False}
+    try:
+        ray.init(**own, log_to_driver=False, logging_level="error")
+    except (ConnectionError, ValueError, RuntimeError, OSError) as error:
+        raise InfrastructureError(
+            f"no Ray cluster at {address or 'this machine'}: {error}; expected an address of "
+            "`ray start --head`, such as auto or HOST:6379, or none for a cluster of this machine alone"
+        ) from error
+    try:
+        _restore(handler)
+        yield ray
+    finally:
+        ray.shutdown()
+        _restore(handler)
+
+
+def run_tasks(
+    place: Engine, function: Callable[[Item], Any], items: Sequence[Item], workers: int
+) -> Iterator[tuple[Item, Any]]:
+    """Call a function on each item as tasks of Ray, at most `workers` at a time; yield items and results as they come.
+
+    A task whose process or node is lost is repeated. Tasks run in this process's folder, so that relative paths hold.
+
+    Raises:
+        DependencyError, InfrastructureError: as of `connect_cluster`; a task was lost every time.
+        Error: what the function raised.
+    """
+    with connect_cluster(place.address) as ray:
+        task = ray.remote(num_cpus=1, num_gpus=place.worker_gpus, max_retries=RETRIES)(_call)
+        left, running = list(reversed(items)), dict[Any, Item]()
+        try:
+            while left or running:
+                while left and len(running) < workers:
+                    item = left.pop()
+                    running[task.remote(function, item, str(Path.cwd()))] = item
+                (done,), _ = ray.wait(list(running))
+                yield running.pop(done), _receive(ray, done)
+        finally:
+            for ref in running:
+                ray.cancel(ref, force=True)
+
+
+def map_batches(
+    place: Engine,
+    kind: type,
+    arguments: Mapping[str, Any],
+    rows: Iterable[Mapping[str, Any]],
+    workers: int,
+    batch: int,
+) -> Iterator[dict[str, Any]]:
+    """Give rows to a pool of actors, a batch at a time, by Ray Data; yield rows of their answers as they come.
+
+    Args:
+        place: where.
+        kind: class that is made once in each actor, with `arguments`, and called with {name: [B]} for {name: [B]}.
+        arguments: by name.
+        rows: plain values by name.
+        workers: number of actors.
+        batch: rows of a call.
+
+    Raises:
+        DependencyError, InfrastructureError: as of `connect_cluster`; an actor was lost every time.
+        Error: what an actor raised.
+    """
+    with connect_cluster(place.address) as ray:
+        import ray.data as ray_data
+
+        ray_data.DataContext.get_current().enable_progress_bars = False
+        logging.getLogger("ray.data").setLevel(logging.ERROR)
+        pool = ray_data.ActorPoolStrategy(size=workers)
+        found = ray_data.from_items([dict(row) for row in rows], override_num_blocks=workers).map_batches(
+            _Called,
+            fn_constructor_kwargs={"kind": kind, "arguments": dict(arguments), "folder": str(Path.cwd())},
+            batch_size=batch,
+            compute=pool,
+            num_cpus=1,
+            num_gpus=place.worker_gpus,
+        )
+        try:
+            for row in found.iter_rows():
+                if FAILED in row:
+                    raise _remake_error(row[FAILED], row["text"])
+                yield row
+        except ray.exceptions.RayError as error:
+            raise _find_cause(error) from error
+
+
+class _Called:
+    """An object in an actor of Ray Data, in the folder of whoever asks it."""
+
+    def __init__(self, kind: type, arguments: Mapping[str, Any], folder: str) -> None:
+        os.chdir(folder)
+        self._object = kind(**arguments)
+
+    def __call__(self, batch: Mapping[str, Any]) -> Any:
+        """Return the object's answer, or the error that it raised on purpose: Ray Data would send its text alone."""
+        try:
+            return self._object(batch)
+        except Error as error:
+            return {FAILED: [type(error).__name__], "text": [str(error)]}
+
+
+def _call(function: Callable[[Item], Any], item: Item, folder: str) -> Any:
+    """Call a function in another process; it has one core."""
+    os.chdir(folder)
+    os.environ.setdefault("WIW_NUM_THREADS", "1")
+    return function(item)
+
+
+def _receive(ray: Any, ref: Any) -> Any:
+    try:
+        return ray.get(ref)
+    except ray.exceptions.RayError as error:
+        raise _find_cause(error) from error
+
+
+def _find_cause(error: Any) -> Exception:
+    """Return the error that work on the cluster has raised on purpose, else that the work was lost."""
+    found: BaseException | None = error
+    while found is not None:
+        cause = found.__cause__ if not hasattr(found, "cause") else found.cause
+        if isinstance(found, Error):
+            return found
+        found = cause if isinstance(cause, BaseException) else None
+    text = str(error).strip()
+    return InfrastructureError(f"work on the Ray cluster was lost: {text}; run the same again, with fewer workers")
+
+
+def _remake_error(name: str, text: str) -> Error:
+    """Return an error from the name of its class."""
+    kind = getattr(errors, name, InfrastructureError)
+    return kind(text) if issubclass(kind, Error) else InfrastructureError(text)
+
+
+def _restore(handler: Any) -> None:
+    """Put back the handler of SIGTERM, which Ray replaces: a run that is stopped is closed in order."""
+    try:
+        signal.signal(signal.SIGTERM, handler)
+    except ValueError:  # not in the main thread, where Ray replaces none
+        return
