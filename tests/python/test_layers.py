@@ -25,6 +25,7 @@ FACES = {
     "types",
     "weight_file",
     "errors",
+    "benchmark",
     "files",
     "gymnasium_ids",
     "json_text",

@@ -10,6 +10,7 @@ import pytest
 from fakes import LineTask
 
 import wiw
+from wiw import benchmark
 from wiw.errors import ArgumentError, StoreError
 from wiw.runs.judges import JudgedRow, JudgeRecord
 from wiw.runs.rows import OutcomeRow, decision_row, decode_jpeg, encode_jpeg, strip, to_json
@@ -111,6 +112,7 @@ def old_run(tmp_path, monkeypatch):
         connection.executescript(dump)
         ((version,),) = connection.execute("SELECT wiw_version FROM run")
     monkeypatch.setattr(wiw, "__version__", version)
+    monkeypatch.setattr(benchmark, "VERSION", benchmark.FIRST)
     return folder
 
 

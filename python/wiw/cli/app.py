@@ -11,6 +11,7 @@ from typing import Any, NoReturn
 import tyro
 
 import wiw
+from wiw import benchmark
 from wiw.cli.blame import blame
 from wiw.cli.check_model import check_model
 from wiw.cli.collect_decisions import collect_decisions
@@ -243,7 +244,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     debug = "--debug" in given
     given = [RENAMED_OPTIONS.get(argument, argument) for argument in given if argument != "--debug"]
     if given == ["--version"]:
-        print(f"wiw {wiw.__version__}")
+        print(f"wiw {wiw.__version__}, benchmark {benchmark.VERSION}")
         return 0
     try:
         with raise_on_stop_signals():

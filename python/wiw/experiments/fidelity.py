@@ -113,7 +113,7 @@ def _replay(
         [ModelInput(query.observation) for query in queries],
         plans,
         [range(len(own)) for own in plans],
-        _view_of(imagined[0][0], batch.reviser.frames.ends),
+        _view_of(imagined[0][0], batch.reviser.frames.ends, batch.imagined.source_size),
         Clock(),
     )
     oracle = ModelImaginer(Attempted(model, math.inf))
@@ -137,8 +137,9 @@ def _copy_memory(situation: Situation) -> Situation:
     return replace(situation, memory=deepcopy(situation.memory))
 
 
-def _view_of(rollout: Rollout, ends: bool) -> FrameSpec:
-    return FrameSpec(rollout.view, (rollout.frames.shape[-3], rollout.frames.shape[-2]), ends)
+def _view_of(rollout: Rollout, ends: bool, source_size: tuple[int, int] | None) -> FrameSpec:
+    """Return the rollout's own view and size, of panoramas as large as those that its model was asked for."""
+    return FrameSpec(rollout.view, (rollout.frames.shape[-3], rollout.frames.shape[-2]), ends, source_size)
 
 
 def _compare(imagined: Sequence[Rollout], scores: NDArray[np.float64], truth: _Truth) -> Fidelity:

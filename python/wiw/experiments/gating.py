@@ -61,6 +61,7 @@ class PartialImagination(Imagination):
 
     def __init__(self, inner: Imagination, places: Sequence[int], episodes: int) -> None:
         self._inner, self._places, self.view = inner, list(places), inner.view
+        self.source_size = inner.source_size
         self.rollouts: list[Sequence[Rollout] | None] = [None] * episodes
         self.costs: list[Mapping[str, int]] = [{}] * episodes
         for place, own, cost in zip(places, inner.rollouts, inner.costs, strict=True):

@@ -136,7 +136,7 @@ class IsolatedModel(Isolated, WorldModel):
             RaisedError: the model raised an exception.
         """
         seconds = seconds_left()
-        shape = (len(controls), len(controls[0].actions) + 1, *self._accepts.size, 3)
+        shape = (len(controls), len(controls[0].actions) + 1, *observations.image.shape[1:])
         process = self._find_process()
         try:
             spent, answer = process.call(
@@ -216,7 +216,7 @@ def roll_out(
     """Write the model's frames into the memory of the answer; return what it has used up so far."""
     with answer_deadline(seconds):
         frames = host.made.rollout(observations, controls, seeds)
-    require_frames(host.made, frames, controls)
+    require_frames(host.made, frames, observations, controls)
     answer = host.answer.reshape(frames.shape)
     for own, row, control in zip(answer, frames, controls, strict=True):
         own[0] = row[0]

@@ -189,14 +189,21 @@ def _hide_memories(situations: Sequence[Situation]) -> list[Situation]:
 
 
 def _read_declaration(told: Mapping[str, Any]) -> dict[str, Any]:
-    view, size, ends = told["frames"]
-    height, width = size
     return {
         "space": str(told["space"]),
         "needs": tuple(map(str, told["needs"])),
-        "frames": FrameSpec(str(view), (int(height), int(width)), bool(ends)),
+        "frames": _read_frames(**told["frames"]),
         "default_revision": None if told["default_revision"] is None else str(told["default_revision"]),
     }
+
+
+def _read_frames(view: Any, size: Any, ends: Any, source_size: Any) -> FrameSpec:
+    return FrameSpec(str(view), _read_size(size), bool(ends), None if source_size is None else _read_size(source_size))
+
+
+def _read_size(told: Any) -> tuple[int, int]:
+    height, width = told
+    return int(height), int(width)
 
 
 def _read_plans(told: Any) -> list[list[Proposal]]:
@@ -232,7 +239,7 @@ def _declare(thing: Any) -> dict[str, Any]:
     told = {name: getattr(thing, name, getattr(Policy, name)) for name in names}
     told = {name: getattr(Policy, name) if isinstance(value, property) else value for name, value in told.items()}
     frames = told["frames"]
-    return {**told, "needs": list(told["needs"]), "frames": (frames.view, tuple(frames.size), frames.ends)}
+    return {**told, "needs": list(told["needs"]), "frames": asdict(frames)}
 
 
 def make_policy(host: Host, options: Mapping[str, Any]) -> dict[str, Any]:

@@ -130,7 +130,7 @@ class Agent(BaseAgent):
         return {
             "policy": self.policy.describe(),
             "revision": self.reviser.describe(),
-            **self.parts.imaginer.describe(),
+            **self.parts.describe_model(),
             **self.spec.config.describe(),
         }
 

@@ -9,7 +9,7 @@ from typing import Any
 
 from wiw.errors import ArgumentError
 from wiw.loop.config import AgentConfig
-from wiw.loop.decision_pass import AgentParts
+from wiw.loop.decision_pass import AgentParts, choose_frames
 from wiw.loop.imagination import Imaginer, NoModel
 from wiw.loop.imagine import NO_SEMANTICS
 from wiw.loop.memory import EpisodeMemories
@@ -52,7 +52,8 @@ class AgentSpec:
             if config.depth > 1:
                 space.check_search(model, policy, config.depth)
         observers = () if model is None else self.observers
-        return AgentParts(policy, imaginer, reviser, space, config, observers, EpisodeMemories(policy, reviser, model))
+        shown = None if model is None else model.accepts.at_size(choose_frames(policy, reviser, config).source_size)
+        return AgentParts(policy, imaginer, reviser, space, config, observers, EpisodeMemories(policy, reviser, shown))
 
     def _make_reviser(self, policy: Policy, space: str, imagines: bool) -> Policy:
         if self.reviser is not None:

@@ -20,7 +20,7 @@ from wiw.loop.observers import Observer, ScoringBatch
 from wiw.loop.plan_space import PlanSpace
 from wiw.loop.privileged import LiveEnvironments, Privileged
 from wiw.loop.search import Search
-from wiw.policies.base import Policy
+from wiw.policies.base import FrameSpec, Policy
 from wiw.types import Answer, Decision, Proposal, TextAnswer
 
 
@@ -38,9 +38,21 @@ class AgentParts:
     memories: EpisodeMemories
 
     @property
+    def frames(self) -> FrameSpec:
+        """How imagined frames are looked at."""
+        return choose_frames(self.policy, self.reviser, self.config)
+
+    @property
     def needs(self) -> tuple[str, ...]:
         """Inputs that observations must carry beyond images: "depth"."""
         return tuple(sorted({*self.policy.needs, *self.reviser.needs, *self.imaginer.needs}))
+
+    def describe_model(self) -> dict[str, Any]:
+        """Return a JSON-able identity of the world model, and its size where it draws in several."""
+        imaginer, model = self.imaginer, self.imaginer.model
+        if model is None or not model.accepts.is_scalable:
+            return imaginer.describe()
+        return {**imaginer.describe(), "model_size": model.accepts.fit_size(self.frames.source_size)}
 
     def count_spent(self) -> Counter[str]:
         """Return what model and policies have been asked for so far."""
@@ -56,6 +68,21 @@ class AgentParts:
         for part in {id(part): part for part in parts}.values():
             if isinstance(part, Privileged):
                 part.grant(environments)
+
+
+def choose_frames(policy: Policy, reviser: Policy, config: AgentConfig) -> FrameSpec:
+    """Return the frames that the reviser asks for.
+
+    In a search of several levels the proposer looks at imagined ends as it looks at the world: only what is enough for
+    both is enough.
+    """
+    frames = reviser.frames
+    sources = [frames.source_size, *([policy.frames.source_size] if (config.depth or 1) > 1 else [])]
+    known = [source for source in sources if source is not None]
+    if len(known) < len(sources):
+        return replace(frames, source_size=None)
+    height, width = (max(sides) for sides in zip(*known, strict=True))
+    return replace(frames, source_size=(height, width))
 
 
 class DecisionPass:
@@ -100,7 +127,7 @@ class DecisionPass:
             self._inputs,
             search.plans,
             search.origins,
-            self._parts.reviser.frames,
+            self._parts.frames,
             self._ledger.clock,
         )
         futures = self._parts.imaginer.imagine(request)

@@ -67,6 +67,8 @@ class Imagination(ABC):
     """What each episode asked for: consultations, rows and frames."""
     view: View = "perspective"
     """That the model imagines."""
+    source_size: tuple[int, int] | None = None
+    """(height, width) that a model of a range of sizes was asked for; None of a model of one size."""
     pose_errors: Sequence[NDArray[np.float64] | None] | None = None
     """float64 [M, 2] by episode, metres and degrees: how far from their places each plan's frames were taken, in the
     mean; NaN for a plan without imagined frames. None where nobody knows, as for most models."""
@@ -89,6 +91,7 @@ class ImaginationWrapper(Imagination):
 
     def __init__(self, inner: Imagination) -> None:
         self.inner, self.rollouts, self.costs, self.view = inner, inner.rollouts, inner.costs, inner.view
+        self.source_size = inner.source_size
 
     def show(self, frames: FrameSpec) -> list[list[Rollout]]:
         """Return what the wrapped imagination shows."""

@@ -40,6 +40,7 @@ class ImaginedPrimitives(Imagination):
     """What the world model gave, one array a part of the batch."""
     view: View
     """View that the answers show."""
+    source_size: tuple[int, int] | None
 
     def show(self, frames: FrameSpec) -> list[list[Rollout]]:
         """Return the rollouts in other views than the reviser's."""
@@ -61,7 +62,7 @@ class ImaginedPrimitives(Imagination):
 
 def imagine_primitives(model: WorldModel, request: Request) -> ImaginedPrimitives:
     """Imagine every plan of every episode and show the futures in the views that the reviser asked for."""
-    accepts, clock = model.accepts, request.clock
+    accepts, clock = model.accepts.at_size(request.frames.source_size), request.clock
     with clock("platform"):
         plans = [[plan.actions for plan in own] for own in request.plans]
         batch = planner.Batch.build(plans, make_model_spec(accepts, request.frames.ends))
@@ -85,7 +86,8 @@ def imagine_primitives(model: WorldModel, request: Request) -> ImaginedPrimitive
     with clock("platform"):
         rollouts = _show(batch, panoramas, answers, accepts.view, request.frames)
         costs = _cost(batch, len(request.keys))
-        return ImaginedPrimitives(rollouts, costs, request.observations, batch, answers, accepts.view)
+        source_size = accepts.size if model.accepts.is_scalable else None
+        return ImaginedPrimitives(rollouts, costs, request.observations, batch, answers, accepts.view, source_size)
 
 
 def _show(

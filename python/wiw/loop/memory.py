@@ -15,7 +15,7 @@ from wiw.loop.history import EpisodeHistories
 from wiw.loop.imagination import Imaginer
 from wiw.policies.base import Policy, Situation
 from wiw.types import ArmObservation, Goal, Key, Observation
-from wiw.world_models.base import WorldModel
+from wiw.world_models.base import Accepts
 
 
 @dataclass(frozen=True)
@@ -59,11 +59,17 @@ class EpisodeMemory:
 
 
 class EpisodeMemories:
-    """Memories of all live episodes; an episode's is made with its first decision."""
+    """Memories of all live episodes; an episode's is made with its first decision.
 
-    def __init__(self, policy: Policy, reviser: Policy, model: WorldModel | None) -> None:
+    Args:
+        policy: that proposes.
+        reviser: that scores.
+        accepts: declaration of the world model, in the size that it is asked for; None without one.
+    """
+
+    def __init__(self, policy: Policy, reviser: Policy, accepts: Accepts | None) -> None:
         self._policy, self._reviser = policy, reviser
-        self.histories = EpisodeHistories(None if model is None else model.accepts)
+        self.histories = EpisodeHistories(accepts)
         """What world models with a memory are shown."""
         self._by_episode: dict[tuple[int, int], EpisodeMemory] = {}
 

@@ -180,7 +180,7 @@ class Cached(ModelWrapper):
         """Return frames as `WorldModel.rollout` promises them; those that are never read may be left unwritten."""
         keys = [_key(self._identity, observations, row, control, seeds) for row, control in enumerate(controls)]
         own = [(1 + control.shared, 1 + control.length) for control in controls]
-        frames = np.empty((len(controls), 1 + len(controls[0].actions), *self.accepts.size, _CHANNELS), np.uint8)
+        frames = np.empty((len(controls), 1 + len(controls[0].actions), *observations.image.shape[1:]), np.uint8)
         with time_separately("cache"):
             frames[:, 0] = observations.image
             missing = [

@@ -29,6 +29,9 @@ class FrameSpec:
     ends: bool = False
     """Whether only what each plan ends with is shown: rollouts of one frame. Models that compute frames one by one then
     compute no other."""
+    source_size: tuple[int, int] | None = None
+    """(height, width) of imagined panoramas that are enough for this view and size: a world model that draws in a range
+    of sizes is asked for these. None: its usual size, which is its largest."""
 
 
 @dataclass(frozen=True)

@@ -100,7 +100,7 @@ def render(run: Run, episodes: int | None = None, scale: float = 1.0, remark: st
             title=title(run),
             task=config["task"],
             created=run.store.created,
-            version=run.store.wiw_version,
+            version=f"{run.store.wiw_version}, benchmark {run.store.benchmark}",
             words=wording(run.store),
             whole=Album.whole,
             remark=remark,

@@ -111,7 +111,7 @@ def merge(stores: Sequence[str | Path], out: str | Path, scratch: str | Path | N
 
 
 def require_equal_manifests(stores: Sequence[RunStore]) -> None:
-    """Check that stores are of the same run: version, task, seed, arms, episodes, scenes, source files, measurements.
+    """Check that stores are of the same run: versions, task, seed, arms, episodes, scenes, source files, measurements.
 
     Raises:
         StoreError: two differ; says in what, and which they are.
@@ -140,7 +140,8 @@ def _read_manifest(store: RunStore) -> dict[str, Any]:
     episodes = [{**asdict(episode), "geodesic": None} for episode in store.episodes()]  # may be measured in one alone
     limits = {name: info["limits"].get(name) for name in ("fidelity", "lpips")}
     kept = {name: info.get(name) for name in ("sources", "scenes")}
-    return {"wiw": store.wiw_version, **store.config, "salt": store.salt, **limits, **kept, "episode": episodes}
+    versions = {"wiw": store.wiw_version, "benchmark": store.benchmark}
+    return {**versions, **store.config, "salt": store.salt, **limits, **kept, "episode": episodes}
 
 
 def _compare(first: Any, second: Any, place: str) -> Iterator[tuple[str, Any, Any]]:

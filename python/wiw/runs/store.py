@@ -19,6 +19,7 @@ from pathlib import Path
 from typing import Any
 
 import wiw
+from wiw import benchmark
 from wiw.errors import ArgumentError, StoreError
 from wiw.runs.faults import explain_faults, find_remedy
 from wiw.runs.file_systems import find_network
@@ -120,8 +121,9 @@ class RunStore:
                 connection.execute(statement)
             connection.execute(f"PRAGMA application_id = {APPLICATION_ID}")
             connection.execute(f"PRAGMA user_version = {SCHEMA_VERSION}")
+            recorded = {"benchmark": benchmark.VERSION, **info}
             connection.execute(
-                "INSERT INTO run VALUES (1, ?, ?, ?, ?)", (created, wiw.__version__, to_json(config), to_json(info))
+                "INSERT INTO run VALUES (1, ?, ?, ?, ?)", (created, wiw.__version__, to_json(config), to_json(recorded))
             )
             connection.executemany(
                 "INSERT INTO episode VALUES (?, ?, ?, ?, ?, ?, ?, ?, ?, ?, ?, ?, ?)",
@@ -167,7 +169,7 @@ class RunStore:
         return store
 
     def require_version(self) -> None:
-        """Check that this is the version of wiw that started the run.
+        """Check that this is the version of wiw, and of the benchmark, that started the run.
 
         Raises:
             StoreError: this is another.
@@ -176,6 +178,20 @@ class RunStore:
             raise StoreError(
                 f"{self.path} was begun by wiw {self.wiw_version}, this is {wiw.__version__}: results of two versions "
                 "must not be mixed; install that version or start a new run"
+            )
+        self.require_benchmark()
+
+    def require_benchmark(self) -> None:
+        """Check that episodes of the run would be decided alike today.
+
+        Raises:
+            StoreError: the run is of another version of the benchmark.
+        """
+        if self.benchmark != benchmark.VERSION:
+            raise StoreError(
+                f"{self.path} is of version {self.benchmark} of the benchmark, and this wiw runs version "
+                f"{benchmark.VERSION}, in which decisions differ (docs/results.md); use the wiw that began the run, or "
+                "start a new one. Its records can still be read, reported and exported"
             )
 
     def require_task(self, task: dict[str, Any]) -> None:
@@ -279,6 +295,11 @@ class RunStore:
     def wiw_version(self) -> str:
         """Version of wiw that began the run."""
         return str(self._value("wiw_version"))
+
+    @property
+    def benchmark(self) -> int:
+        """Version of the benchmark that the run is of."""
+        return int(self.info.get("benchmark", benchmark.FIRST))
 
     @property
     def created(self) -> str:

@@ -81,13 +81,14 @@ def verify(run: str | Path, episodes: int = 3, seed: int = 0) -> Verification:
 
     Raises:
         ArgumentError: fewer than one episode.
-        StoreError: no readable run, one that was begun with objects in memory, whose task or source files have changed,
-            or without an ended episode.
+        StoreError: no readable run, one of another version of the benchmark, one that was begun with objects in memory,
+            whose task or source files have changed, or without an ended episode.
         FileError: a scene is not there.
     """
     if episodes < 1:
         raise ArgumentError(f"verify: expected episodes of at least 1, got {episodes}")
     with RunStore.read(run) as store:
+        store.require_benchmark()
         ended = {(row["arm"], row["episode"]): row for row in store.recorded_outcomes() if row["status"] == "done"}
         if not ended:
             raise StoreError(f"{store.path} has no ended episode that could be run again; see `wiw resume`")

@@ -165,7 +165,7 @@ def _utilities(log: RunLog, labels: Mapping[str, str]) -> list[Utility]:
 def require_comparable(
     a: RunLog, b: RunLog, pairs: Sequence[tuple[str, str]] = (), unlike_budgets: bool = False
 ) -> None:
-    """Check that two runs have the same task, seed, episodes and budget, so that their episodes can be paired.
+    """Check that two runs have the same benchmark, task, seed, episodes and budget, so that episodes can be paired.
 
     Args:
         a: run.
@@ -176,6 +176,10 @@ def require_comparable(
     Raises:
         StoreError: the first field that differs, with both values and what to do; of budgets all that differ.
     """
+    versions = [a.store.benchmark, b.store.benchmark]
+    if versions[0] != versions[1]:
+        advice = "scores of unlike versions differ by the benchmark itself (docs/results.md): run the older one again"
+        _refuse(a, b, "version of the benchmark", versions, advice)
     ours, theirs = a.store.config, b.store.config
     for name in dict.fromkeys([*ours["task"], *theirs["task"]]):
         values = [_value(config["task"].get(name)) for config in (ours, theirs)]

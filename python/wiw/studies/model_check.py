@@ -88,6 +88,7 @@ CHECKS: Mapping[str, str] = {
     "inputs": "It leaves alone what it is given",
     "memory": "It leaves alone what it has answered",
     "length": "It takes plans of another length",
+    "size": "It answers in the smallest size that it declares, too",
     "identity": "It describes itself as JSON, and has a version if its rollouts are to be cached",
     "speed": "How long a rollout takes",
 }
@@ -216,6 +217,7 @@ class _ModelExaminer:
             "causal": self._check_causality,
             "history": self._check_history,
             "length": self._check_short_plans,
+            "size": self._check_smallest_size,
             "inputs": self._check_inputs,
             "memory": self._check_memory,
         }
@@ -265,13 +267,18 @@ class _ModelExaminer:
         """Return why a check can be skipped; empty if it cannot."""
         if name in ("batch", "causal", "history") and self._done["random"].findings:
             return "every comparison would fail: its answers are random"
-        if name == "causal" and not self.accepts.causal:
-            return "it declares causal=False"
-        if name == "history" and self.accepts.history < 2:
-            return "it needs none"
-        if name == "length" and self.accepts.frames:
-            return f"it declares {self.accepts.frames} frames"
-        return ""
+        declared = {
+            "causal": not self.accepts.causal and "it declares causal=False",
+            "history": self.accepts.history < 2 and "it needs none",
+            "length": self.accepts.frames and f"it declares {self.accepts.frames} frames",
+            "size": self._find_size_skip_reason(),
+        }
+        return str(declared.get(name) or "")
+
+    def _find_size_skip_reason(self) -> str:
+        if not self.accepts.is_scalable:
+            return "it declares one size"
+        return "the history that it needs was observed in the largest size" if self.accepts.history else ""
 
     def _check_answer(self) -> Iterator[Finding]:
         self.rows = self.queries.rows([plan[: self.steps] for plan in self.plans])
@@ -282,6 +289,10 @@ class _ModelExaminer:
 
     def _check_short_plans(self) -> Iterator[Finding]:
         self.queries.ask(self.queries.rows([plan[:SHORT] for plan in self.plans]))
+        yield from ()
+
+    def _check_smallest_size(self) -> Iterator[Finding]:
+        self.queries.ask(self.queries.rows([plan[: self.steps] for plan in self.plans], self.accepts.smallest))
         yield from ()
 
     def _check_first_frames(self) -> Iterator[Finding]:

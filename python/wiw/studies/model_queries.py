@@ -79,15 +79,18 @@ class ModelQueries:
         """Return what the model has done to its inputs and answers so far."""
         return read_watch(self._watch)
 
-    def rows(self, plans: Sequence[Sequence[Any]]) -> list[Row]:
-        """Return the rows of these plans, of primitives or poses, in each episode."""
+    def rows(self, plans: Sequence[Sequence[Any]], size: tuple[int, int] | None = None) -> list[Row]:
+        """Return the rows of these plans, of primitives or poses, in each episode.
+
+        Observations are in the model's usual size, or another of those that it declares.
+        """
         recorder = _RequestRecorder(self._model)
         proposals = [[Proposal(np.array(plan)) for plan in plans] for _ in self._moments]
         origins = [range(len(plans)) for _ in proposals]
         space, keys = plan_space(self._space), [moment.key for moment in self._moments]
         observations = [moment.shown.observation for moment in self._moments]
         inputs = [moment.shown for moment in self._moments]
-        frames = FrameSpec("front", (48, 48))
+        frames = FrameSpec("front", (48, 48), source_size=size)
         space.imagine(recorder, Request(space, keys, observations, inputs, proposals, origins, frames, Clock()))
         asked = {
             seed_of(moment.key, number): (moment.shown.simulator, np.array(plan))

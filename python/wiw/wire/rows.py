@@ -38,11 +38,11 @@ class Row:
     def shape(self) -> tuple[Any, ...]:
         """Return what the rows of a batch have in common.
 
-        The number of actions, the shapes of ids and of the history's poses, and the ids' kind.
+        The size of the image, the number of actions, the shapes of ids and of the history's poses, and the ids' kind.
         """
         ids, past = self.control.ids, self.history
         kinds = () if ids is None else (ids.shape, ids.dtype.str)
-        return len(self.control.actions), *kinds, *(() if past is None else past.poses.shape[1:])
+        return self.image.shape, len(self.control.actions), *kinds, *(() if past is None else past.poses.shape[1:])
 
 
 def pack_row(observations: Conditioning, row: int, control: Control, seed: int) -> bytes:

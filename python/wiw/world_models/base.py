@@ -11,7 +11,7 @@ from abc import ABC, abstractmethod
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from contextvars import ContextVar
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import lru_cache
 from hashlib import blake2b
 from pathlib import Path
@@ -30,6 +30,8 @@ CONTROLS = ("image", "text", "trajectory", "viewpoint", "action")
 NEEDS = ("depth", "semantic", "history", "simulator")
 HISTORY = 4
 """Frames of a history where a model does not say how many."""
+SMALLEST_PANORAMA = (16, 32)
+"""Least (height, width) of the built-in models that draw in any size."""
 
 
 @dataclass(frozen=True)
@@ -52,6 +54,29 @@ class Accepts:
     """Frames of `Conditioning.history`, the observation included; 0 where the model needs none."""
     seeded: bool = True
     """Whether answers depend on the seeds; a model without random numbers is handed zeros."""
+    smallest: tuple[int, int] | None = None
+    """Least (height, width) that the model may be asked for, up to `size`; None for a model of one size."""
+
+    @property
+    def is_scalable(self) -> bool:
+        """Whether the model draws in a range of sizes."""
+        return self.smallest is not None
+
+    def takes_size(self, size: Sequence[int]) -> bool:
+        """Return whether the model may be asked for frames of this (height, width)."""
+        return tuple(size) == self.fit_size(size)
+
+    def fit_size(self, size: Sequence[int] | None) -> tuple[int, int]:
+        """Return the (height, width) nearest to `size` that the model draws in; for None its usual one, the largest."""
+        if size is None or self.smallest is None:
+            return self.size
+        ranges = zip(self.smallest, size, self.size, strict=True)
+        height, width = (min(max(least, own), most) for least, own, most in ranges)
+        return height, width
+
+    def at_size(self, size: Sequence[int] | None) -> Accepts:
+        """Return the declaration for one size alone, the nearest to `size`."""
+        return replace(self, size=self.fit_size(size), smallest=None)
 
 
 def accepts(
@@ -70,14 +95,16 @@ def accepts(
     cacheable: bool = False,
     history: int | None = None,
     seeded: bool = True,
+    smallest: tuple[int, int] | None = None,
 ) -> Accepts:
     """Declares what a world model takes and gives (paper, section "Unified Action API").
 
     Args:
         control: which member of `Control` the model reads: "image" (none), "text", "trajectory", "viewpoint", "action".
         view: "perspective" (HFOV 90 front view) or "panorama" (equirectangular).
-        size: (height, width) of its input and output; default 480x480 or 576x1024. A perspective view of any shape is
-            90 degrees wide and has square pixels: what a wide one does not reach of an agent's view is black there.
+        size: (height, width) of its input and output, the largest of a range; default 480x480 or 576x1024. A
+            perspective view of any shape is 90 degrees wide and has square pixels: what a wide one does not reach of an
+            agent's view is black there.
         frames: length of a rollout with frame 0; 0 means any. Shorter plans are padded, longer ones chunked.
         space: what the actions are that it follows, a name of `wiw.loop.plan_space`: "discrete" primitives, or "pose7"
             poses of a gripper. An agent that plans in others refuses the model.
@@ -94,6 +121,9 @@ def accepts(
         history: frames of the history with needs=("history",), the observation included; None means 4.
         seeded: whether answers depend on the seeds. A model that draws no random numbers says False: it is handed
             zeros, and its cached rollouts serve every run, whatever the salt of its seeds.
+        smallest: least (height, width) of panoramas of a model that draws in any size from there to `size`: it is asked
+            for no more than who looks at its frames needs (`wiw.policies.base.FrameSpec.source_size`), and finds the
+            size by the observations. None: it has one size.
 
     Raises:
         ArgumentError: a value is not one of the above, or a history is given that is not needed.
@@ -129,7 +159,18 @@ def accepts(
         cacheable,
         history,
         seeded,
+        _check_smallest(smallest, size, view),
     )
+
+
+def _check_smallest(smallest: Sequence[int] | None, size: tuple[int, int], view: View) -> tuple[int, int] | None:
+    if smallest is None:
+        return None
+    if view != "panorama":
+        raise ArgumentError("accepts: smallest is for panoramas; a perspective model has one size")
+    if len(smallest) != 2 or not all(1 <= least <= most for least, most in zip(smallest, size, strict=True)):
+        raise ArgumentError(f"accepts: expected smallest (height, width) of at most {size} pixels, got {smallest}")
+    return int(smallest[0]), int(smallest[1])
 
 
 def _check_history(history: int | None, needs: Sequence[str]) -> int:
@@ -210,7 +251,7 @@ class WorldModel(ABC):
         """Imagines one future per row.
 
         Args:
-            observations: B rows in the declared view and size.
+            observations: B rows in the declared view and size; of a range of sizes, in that of the frames wanted.
             controls: B rows; frame k is what follows action k.
             seeds: uint64 [B], one per row, so that results do not depend on how rows are batched; 0 where `accepts`
                 says seeded=False.
@@ -348,18 +389,18 @@ def check_rollout(
     """
     observed = sample(observations.image).copy()  # a model may write into what it is handed
     frames = model.rollout(observations, controls, seeds)
-    require_frames(model, frames, controls)
+    require_frames(model, frames, observations, controls)
     check_pictures(type(model.unwrapped).__name__, observed, frames, controls)
     return frames
 
 
-def require_frames(model: WorldModel, frames: Any, controls: Sequence[Control]) -> None:
-    """Require the type, dtype, shape and number of frames that were asked for.
+def require_frames(model: WorldModel, frames: Any, observations: Conditioning, controls: Sequence[Control]) -> None:
+    """Require the type, dtype, shape and number of frames that were asked for, in the size of the observations.
 
     Raises:
         ContractError: they are others, or there are NaN.
     """
-    expected = (len(controls), len(controls[0].actions) + 1, *model.accepts.size, 3)
+    expected = (len(controls), len(controls[0].actions) + 1, *observations.image.shape[1:])
     if not isinstance(frames, np.ndarray) or frames.dtype != np.uint8 or frames.shape != expected:
         kind, came = _breach(frames, expected)
         raise ContractError(

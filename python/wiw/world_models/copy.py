@@ -10,13 +10,15 @@ from numpy.typing import NDArray
 
 from wiw.errors import ArgumentError
 from wiw.types import GRIPPER_POSES, PRIMITIVES, Conditioning, Control
-from wiw.world_models.base import WorldModel, accepts
+from wiw.world_models.base import SMALLEST_PANORAMA, WorldModel, accepts
 
 
 class Copy(WorldModel):
     """Predict that every future frame equals the present one. A model that scores no better has added nothing."""
 
-    accepts = accepts(control="image", view="panorama", causal=True, best_batch=64, seeded=False)
+    accepts = accepts(
+        control="image", view="panorama", causal=True, best_batch=64, seeded=False, smallest=SMALLEST_PANORAMA
+    )
     version = "1"
 
     def rollout(

@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from wiw.errors import ArgumentError
 from wiw.types import GRIPPER_POSES, PRIMITIVES, Conditioning, Control, View
-from wiw.world_models.base import WorldModel, accepts
+from wiw.world_models.base import SMALLEST_PANORAMA, WorldModel, accepts
 
 
 class Oracle(WorldModel):
@@ -23,15 +23,23 @@ class Oracle(WorldModel):
     ceiling: a policy may succeed by chance where futures are wrong. It alone is handed the simulator.
 
     Args:
-        size: height and width of its frames; 576x1024, or 480x480 before a table, where None. A policy that looks at
-            smaller frames loses nothing by less.
+        size: height and width of its frames, whoever looks at them; where None, up to 576x1024 as the reviser needs,
+            480x480 in front views and before a table.
         view: "perspective" for front views alone in place of panoramas; before a table there is no other.
 
     Raises:
         ArgumentError: no size, or a view that the plans do not lead through.
     """
 
-    accepts = accepts(control="action", view="panorama", needs=("simulator",), causal=True, best_batch=64, seeded=False)
+    accepts = accepts(
+        control="action",
+        view="panorama",
+        needs=("simulator",),
+        causal=True,
+        best_batch=64,
+        seeded=False,
+        smallest=SMALLEST_PANORAMA,
+    )
 
     def __init__(self, size: Sequence[int] | None = None, view: View | None = None) -> None:
         own = type(self).accepts
@@ -48,7 +56,7 @@ class Oracle(WorldModel):
         if vars(self):  # view and size are named in the manifest where they are chosen
             shown = view or own.view
             usual = own.size if shown == own.view else accepts("image", shown).size
-            self.accepts = replace(own, view=shown, size=usual if size is None else self.size)
+            self.accepts = replace(own, view=shown, size=usual if size is None else self.size, smallest=None)
 
     def rollout(
         self, observations: Conditioning, controls: Sequence[Control], seeds: NDArray[np.uint64]

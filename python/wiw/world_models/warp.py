@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from wiw.reproject import warp
 from wiw.types import Conditioning, Control, View
-from wiw.world_models.base import WorldModel, accepts
+from wiw.world_models.base import SMALLEST_PANORAMA, WorldModel, accepts
 
 
 class Warp(WorldModel):
@@ -20,7 +20,15 @@ class Warp(WorldModel):
     video generator that scores less has not learnt what one depth image already tells.
     """
 
-    accepts = accepts(control="trajectory", view="panorama", needs=("depth",), causal=True, best_batch=64, seeded=False)
+    accepts = accepts(
+        control="trajectory",
+        view="panorama",
+        needs=("depth",),
+        causal=True,
+        best_batch=64,
+        seeded=False,
+        smallest=SMALLEST_PANORAMA,
+    )
     version = "1"
 
     def __init__(self, view: View = "panorama", size: tuple[int, int] | None = None) -> None:
@@ -28,7 +36,8 @@ class Warp(WorldModel):
 
         Args:
             view: "panorama", or "perspective" for a model that sees and draws the front view alone.
-            size: (height, width) of input and output; 576x1024, in a front view 480x480, if not given.
+            size: (height, width) of input and output, whoever looks at them; if not given, up to 576x1024 as the
+                reviser needs, in a front view 480x480.
         """
         if (view, size) != ("panorama", None):  # named in the manifest only where they are chosen
             self.view, self.size = view, size

@@ -41,7 +41,8 @@ def parse_declaration(text: str) -> Accepts:
         if values["template"] is not None:
             phrases = {Action(name): phrase for name, phrase in values["template"].pop("phrases")}
             values["template"] = TextTemplate(phrases=phrases, **values["template"])
-        return accepts(**{**values, "size": tuple(values["size"])})
+        sizes = {name: tuple(values[name]) for name in ("size", "smallest") if values.get(name) is not None}
+        return accepts(**{**values, **sizes})
     except (ValueError, LookupError, TypeError, AttributeError, ArithmeticError, ArgumentError) as error:
         raise RemoteError(
             f"the server's declaration cannot be read: {type(error).__name__}: {error}", "message"

@@ -27,7 +27,10 @@ def check_row(row: Row, accepts: Accepts) -> None:
     Raises:
         RemoteError: what was expected and what came.
     """
-    size, count = tuple(accepts.size), len(row.control.actions)
+    size, count = row.image.shape[:2], len(row.control.actions)
+    if not accepts.takes_size(size):
+        least = f"{accepts.smallest} to " if accepts.is_scalable else ""
+        raise RemoteError(f"row.image: expected {least}{accepts.size} pixels, got shape {row.image.shape}", "row")
     for name in ("image", "depth", "semantic", "history"):
         array, needed = getattr(row, name), name == "image" or name in accepts.needs
         if (array is not None) != needed:
@@ -37,7 +40,7 @@ def check_row(row: Row, accepts: Accepts) -> None:
     if row.image.shape[2:] != (3,):
         raise RemoteError("row: expected images of three channels", "row")
     if row.history is not None:
-        _check_history(row.history, accepts)
+        _check_history(row.history, accepts, size)
     if (row.control.ids is not None) != (accepts.control == "action"):
         raise RemoteError(f"row.ids: a model of control '{accepts.control}' and these ids do not fit", "row")
     if count < 1 or (accepts.frames and count != accepts.frames - 1):
@@ -47,8 +50,8 @@ def check_row(row: Row, accepts: Accepts) -> None:
         raise RemoteError(f"row.actions: {count} frames of {size} pixels are more than can be sent", "row")
 
 
-def _check_history(history: History, accepts: Accepts) -> None:
-    expected, images = (accepts.history, *accepts.size, 3), history.images.shape[1:]
+def _check_history(history: History, accepts: Accepts, size: tuple[int, ...]) -> None:
+    expected, images = (accepts.history, *size, 3), history.images.shape[1:]
     if images != expected:
         raise RemoteError(f"row.history: expected images {expected}, got {images}", "row")
     follows = accepts.control not in ("image", "text")  # those know nothing of primitives or poses

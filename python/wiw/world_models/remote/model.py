@@ -100,7 +100,7 @@ class Remote(WorldModel):
                 "or a shorter history if it needs one, makes it less",
                 "row",
             )
-        frames = np.empty((len(controls), 1 + len(controls[0].actions), *self.accepts.size, 3), np.uint8)
+        frames = np.empty((len(controls), 1 + len(controls[0].actions), *observations.image.shape[1:]), np.uint8)
         frames[:, 0] = observations.image
         for own, control, answer in zip(frames, controls, self._link.ask(rows, give_up), strict=True):
             wanted = own[1 + control.shared : 1 + control.length]
