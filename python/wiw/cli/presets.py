@@ -11,8 +11,8 @@ from wiw.tasks.presets import DEFAULT, Preset, load_preset
 
 
 def list_settings(task: str, preset: str | Path) -> list[str]:
-    """Return what a preset sets otherwise than the default: a line for the policy that it names, for rules, for generated
-    episodes, and one for the options of each policy and model.
+    """Return what a preset sets otherwise than the default: a line for the policy that it names, for rules, for
+    generated episodes, and one for the options of each policy and model.
     """
     ours, base = load_preset(task, preset), load_preset(task, DEFAULT)
     named = [f"policy: {ours.policy}"] if ours.policy != base.policy else []
