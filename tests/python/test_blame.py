@@ -17,6 +17,7 @@ import pytest
 from fakes import LineAgent, LineTask
 
 import wiw
+from wiw import benchmark
 from wiw.analysis.blame import EpisodeBlame, read_blame
 from wiw.analysis.blame_schemes import LOOP
 from wiw.cli import main
@@ -271,6 +272,7 @@ def old_run(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
             connection.executescript(dump)
             ((version,),) = connection.execute("SELECT wiw_version FROM run")
     monkeypatch.setattr(wiw, "__version__", version)
+    monkeypatch.setattr(benchmark, "VERSION", benchmark.FIRST)
     return folder
 
 

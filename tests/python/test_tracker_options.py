@@ -88,7 +88,7 @@ def test_flags_become_a_recipe(tmp_path: Path) -> None:
         tracker="sam2",
         tracker_option=(f"weights={weights}", "prompt=mask"),
     )
-    recipe = flags.make_recipe("ar", PlanConfig())
+    recipe = flags.make_recipe("ar", None, PlanConfig())
     assert recipe.policy_options == {"vlm": {"vlm": "mock", "tries": 2, "answer_view": "target"}}
     assert (recipe.tracker, recipe.tracker_options) == ("sam2", {"weights": str(weights), "prompt": "mask"})
     for wrong, message in (
@@ -96,7 +96,7 @@ def test_flags_become_a_recipe(tmp_path: Path) -> None:
         (AgentFlags(tracker="sam2", tracker_option=("weights",)), "--tracker-option: expected KEY=VALUE"),
     ):
         with pytest.raises(ArgumentError, match=message):
-            wrong.make_recipe("ar", PlanConfig())
+            wrong.make_recipe("ar", None, PlanConfig())
 
 
 def test_a_heuristic_revised_by_a_language_model_and_sam2_is_one_command(
