@@ -67,8 +67,10 @@ def test_a_study_runs_resumes_and_draws_its_page(own: Path, tmp_path: Path, caps
     ended = [(row["arm"], row["episode"], row["seconds"]) for row in log.episodes]
     assert wiw.study(own, out=out, progress=False).save()  # nothing is run again
     assert [(row["arm"], row["episode"], row["seconds"]) for row in wiw.load_run(out / "here").episodes] == ended
+    plan = (out / "study.yaml").read_text()
     with pytest.raises(StoreError, match="episodes"):
         wiw.study(own, out=out, variables={"episodes": 1}, progress=False)
+    assert (out / "study.yaml").read_text() == plan, "it says what was run"
 
 
 def test_variables_are_filled_in_and_arms_are_merged(own: Path) -> None:
