@@ -30,7 +30,7 @@ def test_the_power_of_flips_of_single_episodes_is_the_exact_sum():
 def test_as_many_episodes_do_show_the_difference():
     """With the functions that make the tables, on episodes drawn one by one."""
     plan = wiw.power(20, losses=5, correlation=0.1)
-    assert plan.wins == 25 and plan.episodes == plan.scenes * plan.per_scene
+    assert plan.won == 25 and plan.episodes == plan.scenes * plan.per_scene
     rng = np.random.default_rng(3)
     concentration = 9 * np.array([0.25, 0.05, 0.7])  # correlation 1 / (1 + 9)
     scenes = list(np.repeat(np.arange(plan.scenes), plan.per_scene))
@@ -54,7 +54,10 @@ def test_what_costs_episodes():
     assert wiw.power(15, chance=0.95).episodes > plain
     assert wiw.power(15, arms=5).episodes > plain
     assert wiw.power(15, per_scene=1).scenes > wiw.power(15).scenes
-    assert wiw.power(-15, base=60).scenes == wiw.power(15, base=60).scenes
+    worse, better = wiw.power(-15, base=60), wiw.power(15, base=60)
+    assert worse.scenes == better.scenes
+    assert (worse.won, worse.lost) == (better.lost, better.won) == (2, 17)
+    assert "if 2 % of episodes are won, 17 % are lost" in str(worse)
 
 
 @pytest.mark.parametrize(

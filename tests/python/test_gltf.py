@@ -243,6 +243,17 @@ def test_morph_weights_hold_at_rest(tmp_path: Path, where: str) -> None:
         np.testing.assert_allclose(scene.instances[1]["bounds"], [[0, 0, 9], [1, 1, 9]], atol=1e-5)
 
 
+def test_a_morph_target_without_data_changes_nothing(tmp_path: Path) -> None:
+    glb = Glb()
+    glb.node(glb.mesh(TWO, POSITION=SQUARE), name="part")
+    glb.accessors.append({"componentType": 5126, "type": "VEC3", "count": 4})  # zeros, as the specification has it
+    targets = [{"POSITION": 2}, {"POSITION": add_accessor(glb, np.tile(np.float32([0, 0, 4]), (4, 1)))}]
+    glb.meshes[0] |= {"weights": [0.5, 0.25]}
+    glb.meshes[0]["primitives"][0]["targets"] = targets
+    scene = load(save(glb, tmp_path / "a.glb"))
+    np.testing.assert_allclose(scene.instances[0]["bounds"], [[0, 0, 1], [1, 1, 1]], atol=1e-5)
+
+
 def test_skins_are_drawn_in_the_pose_of_the_file(tmp_path: Path) -> None:
     glb = Glb()
     glb.node(glb.mesh(TWO, POSITION=SQUARE), name="figure", skin=0, translation=[50, 50, 50])
@@ -284,6 +295,14 @@ def test_emissive_only_surfaces_are_drawn(tmp_path: Path, with_texture: bool) ->
         assert np.abs(found[30:66, 30:66].mean((0, 1)) - middle.mean((0, 1))).max() < 6
     else:
         np.testing.assert_allclose(found[48, 48], [255, 255 * 0.25 ** (1 / 2.2), 255], atol=2)
+
+
+@pytest.mark.parametrize("factor", [[0, 0, 0], [1, 1, 1]])
+def test_an_emissive_texture_stands_in_for_a_base_texture_where_it_shines(tmp_path: Path, factor: list[int]) -> None:
+    glb = textured_square()
+    glb.materials[0] = {"emissiveTexture": {"index": 0}, "emissiveFactor": factor}
+    found = draw(load(save(glb, tmp_path / "a.glb")))
+    assert (found[30:66, 30:66].std(axis=(0, 1)).max() > 20) == any(factor)
 
 
 # ---- against rays
@@ -552,12 +571,15 @@ def test_instances_may_be_compressed(tmp_path: Path) -> None:
         ({"byteLength": 8}, "cannot decode"),
         ({"byteLength": 1 << 30}, "but its buffer"),
         ({"count": 1 << 62}, "compressed elements"),
+        ({"count": 200_000_000, "byteStride": 256}, "cannot hold its 200000000 x 256 bytes"),
     ],
 )
 def test_damaged_meshopt_compression_is_refused(tmp_path: Path, change: dict[str, Any], words: str) -> None:
     glb = compressed_bumps()
     view = glb.accessors[0]["bufferView"]
     glb.views[view]["extensions"]["EXT_meshopt_compression"] |= change  # type: ignore[index, operator]
+    if "byteStride" in change and "count" in change:
+        glb.views[view] |= {"byteLength": change["count"] * change["byteStride"], "byteStride": change["byteStride"]}
     with pytest.raises(FileError, match=words):
         load(save_compressed(glb, tmp_path / "a.glb"))
 

@@ -396,6 +396,9 @@ def test_what_the_policy_needs_is_asked_for_in_words(situate: Any) -> None:
         tiny_policy(depth=3)
     with pytest.raises(ArgumentError, match="expected a number for doubt, got 'much'"):
         tiny_policy(doubt="much")
+    for out_of_range in ({"patience": 0}, {"spacing": -1}, {"targets": 0}, {"doubt": 1}, {"commitment": 2}):
+        with pytest.raises(ArgumentError, match=r"policy navigator: expected (patience|doubt)"):
+            tiny_policy(**out_of_range)
 
 
 @pytest.mark.nightly

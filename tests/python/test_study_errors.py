@@ -14,7 +14,7 @@ from wiw.cli import main
 from wiw.errors import ArgumentError
 from wiw.experiments.errors import ERRORS
 from wiw.report.error_page import write_errors
-from wiw.report.error_tables import explain
+from wiw.report.error_tables import explain, print_errors
 from wiw.studies.errors import ErrorSettings, read_errors, study_errors
 
 ARMS = {"error-blur@64": ("blur", 64.0), "error-lag@2": ("lag", 2.0), "error-lag@4": ("lag", 4.0)}
@@ -22,6 +22,7 @@ DISTANCE = {"error-blur@64": 0.5, "error-lag@2": 0.2, "error-lag@4": 0.4}
 COST = {"error-blur@64": 0.0, "error-lag@2": 0.25, "error-lag@4": 0.5}
 """Share of the successes that an arm loses: nothing by blur, in proportion to the distance by lag."""
 EPISODES = 40
+SETTINGS = {"episodes": EPISODES, "seed": 0, "fidelity_share": 0.25}
 
 
 def outcomes() -> list[dict]:
@@ -86,8 +87,7 @@ def test_the_words_say_what_the_numbers_do(table) -> None:
 
 
 def test_the_page_has_figure_tables_and_units(table, tmp_path: Path) -> None:
-    settings = {"episodes": EPISODES, "seed": 0, "fidelity_share": 0.25}
-    written = write_errors([table], settings, "{}", tmp_path)
+    written = write_errors([table], SETTINGS, "{}", tmp_path)
     assert [path.name for path in written] == ["errors.html", "errors.svg", "errors.png", "errors.json"]
     assert all(path.stat().st_size > 0 for path in written)
     page = written[0].read_text()
@@ -105,6 +105,13 @@ def test_unfinished_arms_are_shown_but_not_counted_among_the_costs() -> None:
 def test_an_error_that_costs_nothing_so_far_is_not_sure_to_cost_nothing(table) -> None:
     (looks,) = [cost for cost in table.costs if cost.family == "looks" and cost.measure == "1 - SSIM"]
     assert looks.loss.low < 0 < looks.loss.high < 5
+
+
+def test_errors_that_were_not_measured_are_drawn_without_costs(tmp_path: Path) -> None:
+    found = summarise_errors("imagenav", "matcher", outcomes(), [], ARMS)
+    assert found.costs == () and found.distance == "1 - SSIM"
+    assert all(path.stat().st_size > 0 for path in write_errors([found], SETTINGS, "{}", tmp_path))
+    print_errors([found])
 
 
 @pytest.mark.parametrize("changes", [{"tasks": ("walking",)}, {"kinds": ()}, {"doses": 4}, {"episodes": 0}])
@@ -135,5 +142,9 @@ def test_a_study_goes_on_where_it_stopped(two_rooms: str, tmp_path: Path, capsys
     arguments = ["--out", str(tmp_path / "study"), "--tasks", "imagenav", "--kinds", "blur,ignored", "--doses", "1"]
     assert main(["study", "errors", *arguments, "--episodes", "2", "--scenes", two_rooms, "--read-only"]) == 0
     assert "Errors of control cost" in " ".join(capsys.readouterr().out.split())
+    assert main(["study", "errors", *arguments, "--episodes", "20", "--scenes", two_rooms]) == 2
+    assert "shard-1-of-1, a part of a study of another number of episodes" in capsys.readouterr().err
+    assert main(["study", "errors", "--out", str(tmp_path / "study"), "--kinds", "lag", "--read-only"]) == 2
+    assert "no episode of an arm with an error so far" in capsys.readouterr().err
     numbers = json.loads((tmp_path / "study" / "errors.json").read_text())
     assert np.isfinite(numbers["tasks"][0]["lines"][0]["outcome"]["value"])

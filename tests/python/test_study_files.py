@@ -67,8 +67,10 @@ def test_a_study_runs_resumes_and_draws_its_page(own: Path, tmp_path: Path, caps
     ended = [(row["arm"], row["episode"], row["seconds"]) for row in log.episodes]
     assert wiw.study(own, out=out, progress=False).save()  # nothing is run again
     assert [(row["arm"], row["episode"], row["seconds"]) for row in wiw.load_run(out / "here").episodes] == ended
+    plan = (out / "study.yaml").read_text()
     with pytest.raises(StoreError, match="episodes"):
         wiw.study(own, out=out, variables={"episodes": 1}, progress=False)
+    assert (out / "study.yaml").read_text() == plan, "it says what was run"
 
 
 def test_variables_are_filled_in_and_arms_are_merged(own: Path) -> None:
@@ -102,6 +104,11 @@ def test_variables_are_filled_in_and_arms_are_merged(own: Path) -> None:
         ("[success, rollouts]", "[succes]", "plots: unknown name 'succes'.*Did you mean success"),
         ("keep_images: 0", "keep_image: 0", "settings: unknown name 'keep_image'.*Did you mean keep_images"),
         ("seed: 3", "out: there", "settings: unknown name 'out'"),
+        ("seed: 3", "seed: three", "settings: seed: expected int . None, got 'three'"),
+        ("keep_images: 0", "keep_images: some", "settings: keep_images: expected .*'all'.*, got 'some'"),
+        ("seed: 3", "cache: off", "settings: cache: expected str . .*Path, got False"),
+        ("candidates: 2", "candidates: two", "arms: none: candidates: expected int . None, got 'two'"),
+        ("candidates: 2", "ground_truth: scoring", "ground_truth: expected .*Sequence.*, got 'scoring'"),
         ("{model: none, reviser: null}", "{model: copy}", "reports take the arm 'none' for the reference"),
         ("      front:", "      fr/ont:", "arms"),
         ("runs:\n  here:", "runs: {}\nsmal:\n  here:", "unknown name 'smal'"),

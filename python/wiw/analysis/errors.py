@@ -104,9 +104,9 @@ class ErrorTable:
 
     @property
     def distance(self) -> str:
-        """The distance of frames that costs are given for."""
+        """The distance of frames that costs are given for; the last one where none was measured."""
         known = {name for line in self.lines for name in line.measures}
-        return next(name for name in DISTANCES if name in known)
+        return next((name for name in DISTANCES if name in known), DISTANCES[-1])
 
 
 def summarise_errors(

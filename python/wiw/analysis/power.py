@@ -53,17 +53,22 @@ class Power:
         return self.scenes * self.per_scene
 
     @property
-    def wins(self) -> float:
-        """Percent of episodes that only the better arm succeeds in."""
-        return self.losses + abs(self.difference)
+    def won(self) -> float:
+        """Percent of episodes that only the arm under test succeeds in."""
+        return self.losses + max(self.difference, 0.0)
+
+    @property
+    def lost(self) -> float:
+        """Percent of episodes that only the arm compared with succeeds in."""
+        return self.losses + max(-self.difference, 0.0)
 
     def __str__(self) -> str:
         among = f", as one of {self.arms} arms," if self.arms > 1 else ""
         return (
             f"{self.episodes} episodes in {self.scenes} scenes ({self.per_scene} each) show a difference of "
             f"{self.difference:+g} points to {self.base:g} %{among} with a chance of {100 * self.by_interval:.0f} % by "
-            f"its interval and {100 * self.by_test:.0f} % by the test, if {self.wins:g} % of episodes are won, "
-            f"{self.losses:g} % are lost, and episodes of a scene correlate by {self.correlation:g}."
+            f"its interval and {100 * self.by_test:.0f} % by the test, if {self.won:g} % of episodes are won, "
+            f"{self.lost:g} % are lost, and episodes of a scene correlate by {self.correlation:g}."
         )
 
     def _repr_pretty_(self, printer: Any, cycle: bool) -> None:

@@ -62,7 +62,7 @@ def power(
         pilot: Take it from two arms of this run.
         pilot_arms: Which arms of --pilot; the second is the base.
         base: Success rate of the arm compared with, percent; 20 if nothing says otherwise.
-        losses: Percent of episodes that the better arm loses; 2 if nothing says otherwise.
+        losses: Percent of episodes that the better of the two arms loses; 2 if nothing says otherwise.
         correlation: Correlation between the differences of two episodes of a scene; 0.05 if nothing says otherwise.
         per_scene: Episodes in each scene; 5 if nothing says otherwise.
         chance: Power: the probability of showing the difference if there is one.
@@ -137,7 +137,7 @@ def _print_table(plans: Sequence[Power], chance: float, tasks: Sequence[str] = (
         table.add_row(
             *tasks[index : index + 1],
             f"{one.difference:+g}",
-            f"{one.wins:g}/{one.losses:g}",
+            f"{one.won:g}/{one.lost:g}",
             str(one.scenes),
             str(one.episodes),
             f"{100 * one.by_interval:.0f}",

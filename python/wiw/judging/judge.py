@@ -153,7 +153,7 @@ class TieredJudge(Judge):
 
     @property
     def concurrency(self) -> int:
-        """That of the judge that takes most at a time."""
+        """Most answers judged at a time, by the judge that takes most."""
         return max(tier.concurrency for tier in self.tiers)
 
     def can_judge(self, reference: Reference) -> bool:

@@ -56,7 +56,7 @@ class DrawnThing:
 
 @dataclass(frozen=True)
 class Plan:
-    """Where a plan leads."""
+    """Places that a plan leads through."""
 
     points: NDArray[np.float64]
     """float64 [K + 1, 2] in the frame of the start."""
@@ -65,7 +65,7 @@ class Plan:
 
 @dataclass(frozen=True)
 class _Frame:
-    """Where points lie in the picture."""
+    """Map from the frame of the start to pixels of the picture."""
 
     scale: float
     right: NDArray[np.float64]

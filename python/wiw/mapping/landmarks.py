@@ -35,7 +35,7 @@ class Landmark:
     """Something within sight."""
 
     id: int
-    """That of the object in the map; `OPENING_IDS` more than the opening's."""
+    """Id of the object in the map; of an opening, its number plus `OPENING_IDS`."""
     category: str
     position: NDArray[np.float64]
     """float64 [3] in the frame of the start."""

@@ -44,7 +44,7 @@ class MarkedViews:
     landmarks: Mapping[int, Landmark]
     """By number of the mark. One landmark has one number in all views."""
     boxes: Mapping[int, Mapping[int, LabelBox]]
-    """Where the numbers stand, by number of the view and number of the mark."""
+    """Boxes of the numbers drawn, by number of the view and number of the mark."""
 
 
 def draw_marks(images: NDArray[np.uint8], landmarks: Sequence[Landmark], asked: Iterable[int] = ()) -> MarkedViews:

@@ -175,7 +175,7 @@ class OccupancyGrid:
 
     @cached_property
     def frontiers(self) -> tuple[Frontier, ...]:
-        """Where floor goes on into the unknown, the longest first."""
+        """Edges at which floor goes on into the unknown, the longest first."""
         parts, count = ndimage.label(~self.known)
         small = np.bincount(parts.ravel(), minlength=count + 1) < LEAST_UNKNOWN
         unknown = (parts > 0) & ~small[parts]

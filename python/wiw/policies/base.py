@@ -43,7 +43,7 @@ class Situation:
     goal: Goal
     key: Key
     memory: Any
-    """What `Policy.begin` returned for this episode; the policy may change it."""
+    """Memory of this episode, as `Policy.begin` returned it; the policy may change it."""
     executed: tuple[Any, ...] = ()
     """Primitives, or poses, executed since the episode began."""
     imagines: bool = True
@@ -59,7 +59,7 @@ class Policy(ABC):
     """
 
     space: str = PRIMITIVES
-    """What its plans are made of: a name of `wiw.loop.plan_space`."""
+    """Kind of actions that its plans are made of: a name of `wiw.loop.plan_space`."""
     needs: tuple[str, ...] = ()
     """"depth" where observations must carry it."""
     frames: FrameSpec = FrameSpec()

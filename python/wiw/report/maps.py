@@ -19,7 +19,7 @@ PIXELS_PER_METRE = 60.0
 
 @dataclass(frozen=True)
 class MapFrame:
-    """Where world points lie on a map."""
+    """Frame of a map: its size, and how world points become its pixels."""
 
     width: float
     height: float
@@ -54,7 +54,7 @@ class Trail:
     points: str
     """For an SVG polyline."""
     stops: tuple[Mark, ...]
-    """Where each decision was taken, and at last where the episode ended."""
+    """Places where decisions were taken, and at last where the episode ended."""
 
 
 def frame_of_picture(size: tuple[int, int], world_to_pixel: Sequence[Sequence[float]]) -> MapFrame:

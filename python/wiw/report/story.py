@@ -126,7 +126,7 @@ class Step:
     seconds: Mapping[str, float]
     calls: Mapping[str, float]
     answer: str = ""
-    """What the agent believed and how surely, where the task asks."""
+    """Belief of the agent and how sure it was, where the task asks."""
     refused: str = ""
     """Why ways of a gripper ended early."""
     shot: str = ""
@@ -152,7 +152,7 @@ class Attempt:
     trail: Trail | None
     words: Wording
     choices: Sequence[str] = ()
-    """What answers are chosen from, where the task asks for any."""
+    """Possible answers, where the task asks for one of several."""
     film: str | None = None
     """Film of the episode; as `Album.put` returns it."""
     end: str = ""

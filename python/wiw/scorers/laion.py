@@ -71,7 +71,7 @@ class LaionScorer:
 
     @property
     def card(self) -> ScorerCard:
-        """Who it is; its version is the digest of the head's file."""
+        """Its identity; the version is the digest of the head's file."""
         licence = "Apache-2.0 (head), MIT (CLIP)"
         return ScorerCard("laion-improved-aesthetic", self._digest, licence, {"laion_aesthetic": None})
 

@@ -16,7 +16,7 @@ Range = tuple[float, float] | None
 
 @dataclass(frozen=True)
 class ScorerCard:
-    """Who a scorer is: all that is stored of it beside its scores."""
+    """Identity of a scorer: all that is stored of it beside its scores."""
 
     scorer: str
     """Its id, such as "musiq-koniq"."""
@@ -47,7 +47,7 @@ class Scorer(Protocol):
 
     @property
     def card(self) -> ScorerCard:
-        """Who it is; known before it scores anything."""
+        """Its identity; known before it scores anything."""
         ...
 
     def score(self, paths: Sequence[Path]) -> Iterator[tuple[Path, dict[str, float]]]:

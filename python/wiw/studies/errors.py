@@ -16,7 +16,7 @@ from pathlib import Path
 from typing import Any
 
 from wiw.analysis.errors import ErrorTable, summarise_errors
-from wiw.errors import ArgumentError
+from wiw.errors import ArgumentError, StoreError
 from wiw.experiments.errors import ERRORS
 from wiw.loop import keys
 from wiw.metrics import Lpips
@@ -158,8 +158,13 @@ def study_errors(
     folder = Path(out)
     tables = []
     for task in settings.tasks:
-        done = _run_task(task, settings, folder / task, workers, lpips, watch)
-        tables.append(_read_task(task, settings, done))
+        table = _read_task(task, settings, _run_task(task, settings, folder / task, workers, lpips, watch))
+        if table is None:
+            raise StoreError(
+                f"errors: nothing can be compared in {folder / task}: no episode of {FLOOR}, {CEILING} or of any arm "
+                "with an error was scored; `wiw status` on the folders there says why"
+            )
+        tables.append(table)
     return ErrorStudy(tuple(tables), settings, folder)
 
 
@@ -168,12 +173,25 @@ def read_errors(out: str | Path, settings: ErrorSettings = FULL) -> ErrorStudy:
 
     Args:
         out: folder of the study.
-        settings: that it was begun with; tasks without any run are left out.
+        settings: that it was begun with; tasks in which no arm with an error has ended an episode are left out.
+
+    Raises:
+        StoreError: that is so in all tasks.
     """
     folder = Path(out)
-    parts = {task: sorted(path.parent for path in (folder / task).glob("*/run.sqlite")) for task in settings.tasks}
-    found = tuple(_read_task(task, settings, own) for task, own in parts.items() if own)
+    tables = [_read_task(task, settings, _list_parts(folder / task)) for task in settings.tasks]
+    found = tuple(table for table in tables if table is not None)
+    if not found:
+        raise StoreError(
+            f"errors: {folder} has no episode of an arm with an error so far (tasks {', '.join(settings.tasks)}, "
+            f"errors {', '.join(settings.kinds)}); run the study without --read-only, or name its folder with --out"
+        )
     return ErrorStudy(found, settings, folder)
+
+
+def _list_parts(folder: Path) -> list[Path]:
+    """Return the folders of a task's runs that are there."""
+    return sorted(path.parent for path in folder.glob("shard-*-of-*/run.sqlite"))
 
 
 def _run_task(
@@ -183,9 +201,15 @@ def _run_task(
     recipe, agent = _make_recipes(task, settings)
     arms = [FLOOR, CEILING, *_order_arms(settings.list_arms(task))]
     count, salt = -(-settings.episodes // BLOCK), _find_salt(folder)
+    shards = [Shard(number, count) for number in range(1, count + 1)]
+    others = {path.name for path in _list_parts(folder)} - {shard.folder for shard in shards}
+    if others:
+        raise StoreError(
+            f"errors: {folder} has {min(others)}, a part of a study of another number of episodes than "
+            f"{settings.episodes}; ask for the same --episodes, or name another folder with --out"
+        )
     done = []
-    for number in range(1, count + 1):
-        shard = Shard(number, count)
+    for number, shard in enumerate(shards, 1):
         log = evaluate(
             recipe,
             agent,
@@ -211,7 +235,7 @@ def _run_task(
 
 def _find_salt(folder: Path) -> str:
     """Return the salt that the parts of a run have in common: that of the first one, or a new one."""
-    begun = sorted(path.parent for path in folder.glob("*/run.sqlite"))
+    begun = _list_parts(folder)
     if not begun:
         return keys.draw_salt()
     with RunStore.read(begun[0]) as store:
@@ -240,12 +264,18 @@ def _size_option(settings: ErrorSettings) -> dict[str, Any]:
     return {} if settings.size is None else {"size": list(settings.size)}
 
 
-def _read_task(task: str, settings: ErrorSettings, parts: Sequence[Path]) -> ErrorTable:
-    """Return the numbers of a task from its runs, which may be unfinished."""
+def _read_task(task: str, settings: ErrorSettings, parts: Sequence[Path]) -> ErrorTable | None:
+    """Return the numbers of a task from its runs, which may be unfinished.
+
+    None until an episode is scored in no imagination, in true futures and in an arm with an error.
+    """
     with ExitStack() as stack:
         logs = [load_run(path) for path in parts]
         for log in logs:
             stack.callback(log.close)
+        scored = {row["arm"] for log in logs for row in log.store.outcomes() if row["status"] == "done"}
+        if not {FLOOR, CEILING} <= scored or scored.isdisjoint(settings.list_arms(task)):
+            return None
         return summarise_errors(
             task,
             settings.policy or str(task_class(task).default_policy),

@@ -103,7 +103,7 @@ class Finding:
     """"needs", "raised", "deadline", the kind of a `ContractError`, "frame 0", "pictures", "training", "random",
     "batch", "causal", "history", "plan", "inputs", "memory", "describe", "version", or "slow"."""
     text: str
-    """What is wrong, what was seen, and what to do."""
+    """The fault, what was seen, and what to do."""
     serious: bool = True
     """Whether the contract is broken; else it is good to know."""
 
@@ -119,9 +119,9 @@ class Check:
     """A key of `CHECKS`."""
     findings: tuple[Finding, ...] = ()
     skipped: str = ""
-    """Why it was not looked at; empty if it was."""
+    """Reason why the check was skipped; empty if it was not."""
     detail: str = ""
-    """What else is to be said, such as a time."""
+    """Further remark, such as a time."""
 
     @property
     def result(self) -> Result:

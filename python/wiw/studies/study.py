@@ -120,10 +120,16 @@ def study(
     folder = Path(out) if out is not None else Path("runs") / f"study-{Path(name).stem}"
     for run in plan.runs:
         _require(run)
-    folder.mkdir(parents=True, exist_ok=True)
+    if not (folder / FILE).exists():
+        _write_plan(plan, folder)
+    parts = tuple(_run(run, folder, workers, progress) for run in plan.runs)
+    _write_plan(plan, folder)  # only now: what is there stays where a run refuses other settings
+    return Study(plan, parts, folder)
+
+
+def _write_plan(plan: StudyPlan, folder: Path) -> None:
     with atomic_file(folder / FILE) as draft:
         draft.write_text(yaml.safe_dump(dict(plan.content), sort_keys=False, allow_unicode=True), encoding="utf-8")
-    return Study(plan, tuple(_run(run, folder, workers, progress) for run in plan.runs), folder)
 
 
 def _require(run: StudyRun) -> None:

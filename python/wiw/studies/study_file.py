@@ -28,8 +28,10 @@ from __future__ import annotations
 import re
 from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass, fields
+from inspect import formatannotation
 from pathlib import Path
-from typing import Any
+from types import UnionType
+from typing import Any, Literal, Union, get_args, get_origin, get_type_hints
 
 import yaml
 
@@ -189,7 +191,9 @@ def _read_run(name: str, content: Any, shared: Mapping[str, Any], where: str) ->
     settings = {**shared, **_require_mapping(content.get("settings") or {}, f"{where}: settings")}
     known = [field.name for field in fields(RunConfig) if field.name not in _OWN_SETTINGS]
     _require_known(settings, known, f"{where}: settings")
-    task = TaskRecipe(str(content.get("task", "imagenav")), dict(content.get("task_options") or {}))
+    _require_types(RunConfig, settings, f"{where}: settings")
+    options = _require_mapping(content.get("task_options") or {}, f"{where}: task_options")
+    task = TaskRecipe(str(content.get("task", "imagenav")), dict(options))
     return StudyRun(name, _give_seed(task, settings), agents, RunConfig(**settings), pairs, plots, quality)
 
 
@@ -218,6 +222,7 @@ def _read_arms(arms: Any, agent: Any, where: str) -> dict[str, AgentRecipe]:
 
 def _make_agent(values: Mapping[str, Any], where: str) -> AgentRecipe:
     _require_known(values, _AGENT_KEYS, where)
+    _require_types(AgentRecipe, values, where)
     if "policy" not in values:
         raise ArgumentError(f"{where}: expected a policy, here or in `agent`, got none")
     parts = {name: absolute(str(values[name])) for name in ("policy", "model", "reviser") if values.get(name)}
@@ -255,6 +260,32 @@ def _require_mapping(value: Any, where: str) -> Mapping[str, Any]:
     if not isinstance(value, Mapping):
         raise ArgumentError(f"{where}: expected `name: value` lines, got {value!r}")
     return value
+
+
+def _require_types(declared: type, values: Mapping[str, Any], where: str) -> None:
+    """Check that values are of the types that a dataclass declares for the fields of their names.
+
+    Raises:
+        ArgumentError: one is not; names `where`, the field and its type.
+    """
+    kinds = get_type_hints(declared)
+    for name, value in values.items():
+        if not _fits(value, kinds[name]):
+            raise ArgumentError(f"{where}: {name}: expected {formatannotation(kinds[name])}, got {value!r}")
+
+
+def _fits(value: Any, kind: Any) -> bool:
+    """Return whether a value of a YAML file is of a type; texts are paths, too, and whole numbers are floats."""
+    origin = get_origin(kind)
+    if origin in (Union, UnionType):
+        return any(_fits(value, each) for each in get_args(kind))
+    if origin is Literal:
+        return value in get_args(kind)
+    if kind in (int, float):
+        return isinstance(value, int | kind) and not isinstance(value, bool)
+    if origin is Sequence:
+        return isinstance(value, Sequence) and not isinstance(value, str)
+    return kind is Any or isinstance(value, str if kind is Path else origin or kind)
 
 
 def _require_known(names: Collection[Any], known: Collection[str], where: str) -> None:

@@ -35,7 +35,7 @@ class ARRules:
     confidence: float
     """An answer more probable than this, before it is normalised (`Answer.confidence`), ends the episode at once."""
     prediction: Literal["last", "surest"]
-    """Which answer is the final one; of equally confident ones the earliest."""
+    """Rule for the final answer; of equally confident ones the earliest."""
     lost: Literal["continue", "stop"]
     """Whether the episode goes on when neither panorama nor front view shows the target."""
     box_scale: float

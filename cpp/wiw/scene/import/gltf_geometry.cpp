@@ -31,6 +31,9 @@ std::vector<std::uint32_t> unrolled(const std::vector<std::uint32_t>& corners, s
   return triangles;
 }
 
+/// Whether an accessor has no data, which stands for zeros. Some exporters write such targets of morphs.
+bool is_zero(const Json& accessor) { return accessor["bufferView"].is_null() && accessor["sparse"].is_null(); }
+
 template <int size>
 std::vector<Eigen::Matrix<float, size, 1>> rows_of(const GltfValues& values) {
   std::vector<Eigen::Matrix<float, size, 1>> rows;
@@ -105,7 +108,7 @@ class PrimitiveReader {
     const Json::Array& targets = primitive_["targets"].items();
     for (std::size_t t = 0; t < std::min(targets.size(), weights.size()); ++t) {
       const auto target = index_of(targets[t], attribute, document_["accessors"].items().size());
-      if (!target || weights[t] == 0) continue;
+      if (!target || weights[t] == 0 || is_zero(document_["accessors"].items()[*target])) continue;
       const GltfValues change = data_.read(*target);
       if (change.numbers.size() != sum.numbers.size()) fail("has a morph target that does not fit its vertices");
       for (std::size_t i = 0; i < sum.numbers.size(); ++i) sum.numbers[i] += weights[t] * change.numbers[i];

@@ -25,6 +25,8 @@ std::array<float, size> numbers_or(const Json& list, float otherwise) {
   return numbers;
 }
 
+bool is_positive(float channel) { return channel > 0; }
+
 /// What a material's surface is made of, in either of glTF's two ways to say it.
 struct GltfSurface {
   explicit GltfSurface(const Json& material)
@@ -39,9 +41,9 @@ struct GltfSurface {
   [[nodiscard]] const Json& base_texture() const {
     return gloss.is_null() ? metal["baseColorTexture"] : gloss["diffuseTexture"];
   }
+  [[nodiscard]] bool is_lit() const { return std::ranges::any_of(light, is_positive); }
   [[nodiscard]] bool is_emissive_only() const {
-    const auto is_dark = [](float channel) { return !(channel > 0); };
-    return std::ranges::all_of(std::span(base).first(3), is_dark) && !std::ranges::all_of(light, is_dark);
+    return std::ranges::none_of(std::span(base).first(3), is_positive) && is_lit();
   }
 
   const Json& gloss;
@@ -50,10 +52,12 @@ struct GltfSurface {
   std::array<float, 3> light;
 };
 
+/// The texture of the base colour; that of the light where there is none, or where the base colour is black.
 const Json& drawn_texture(const Json& material) {
   const GltfSurface surface(material);
   const Json& base = surface.base_texture();
-  return base.is_null() || surface.is_emissive_only() ? material["emissiveTexture"] : base;
+  const bool shows_light = surface.is_emissive_only() || (base.is_null() && surface.is_lit());
+  return shows_light ? material["emissiveTexture"] : base;
 }
 
 std::string image_name(std::size_t index) { return "image " + std::to_string(index); }

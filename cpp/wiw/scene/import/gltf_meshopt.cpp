@@ -10,6 +10,10 @@
 namespace wiw::scene {
 namespace {
 
+/// Most decoded bytes for each encoded one: a block of 256 zeros takes at least a quarter of a byte in any version of
+/// the format. What claims more is damaged, and is refused before memory is taken for it.
+constexpr std::size_t kMostExpansion = 1024;
+
 /// Sizes that meshoptimizer takes for granted.
 bool is_valid(std::string_view mode, std::string_view filter, std::size_t count, std::size_t stride) {
   if (mode == "TRIANGLES" || mode == "INDICES") {
@@ -52,6 +56,11 @@ std::vector<std::uint8_t> decode_meshopt(const Json& extension, std::span<const 
                                        std::string(filter) + "', " + std::to_string(count) + " x " +
                                        std::to_string(stride) +
                                        " bytes, which EXT_meshopt_compression does not have (damaged file)");
+  }
+  if (count * stride / kMostExpansion > encoded.size()) {
+    throw FileError(path.string(), "has a bufferView of " + std::to_string(encoded.size()) +
+                                       " bytes that cannot hold its " + std::to_string(count) + " x " +
+                                       std::to_string(stride) + " bytes (damaged file)");
   }
   std::vector<std::uint8_t> decoded(count * stride);
   if (!decode(mode, count, stride, encoded, decoded.data())) {

@@ -69,6 +69,15 @@ class NavigatorOptions:
     targets: int = 8
     """Most places that routes are planned to."""
 
+    def __post_init__(self) -> None:
+        if min(self.patience, self.overlap) <= 0 or self.targets < 1 or min(vars(self).values()) < 0:
+            raise ArgumentError(
+                f"policy navigator: expected patience and overlap above 0, targets of 1 or more and no number below 0, "
+                f"got {self}"
+            )
+        if not (self.doubt < 1 and self.commitment <= 1):
+            raise ArgumentError(f"policy navigator: expected doubt below 1 and commitment of at most 1, got {self}")
+
 
 @dataclass
 class Memory:
@@ -114,7 +123,7 @@ class Navigator(Policy):
         options: see `NavigatorOptions`.
 
     Raises:
-        ArgumentError: an unknown option, or no number.
+        ArgumentError: an unknown option, no number, or one out of range.
         DependencyError: torch or safetensors is not installed.
         WeightsError: no such file, damaged, or of another version.
     """

@@ -35,7 +35,7 @@ from wiw.world_models.video.weights import is_path
 
 @dataclass(frozen=True)
 class PretrainedWeights:
-    """Where a training's first weights come from, and on which device it runs."""
+    """Source of a training's first weights, and the device that it runs on."""
 
     weights: str | None = None
     """A folder or a name on the hub; the model's usual ones if None."""

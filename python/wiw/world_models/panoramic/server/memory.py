@@ -23,7 +23,7 @@ BLURRED = 8
 
 
 class Sight(NamedTuple):
-    """What a memory looks like from a place."""
+    """View of a memory from a place."""
 
     features: NDArray[Any]
     """[H, W, ...]: of the nearest point in each pixel, 0 where there is none."""

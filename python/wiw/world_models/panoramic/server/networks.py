@@ -38,7 +38,7 @@ class MissingError(Exception):
 
 
 class RowError(ValueError):
-    """What is asked for is nothing that the models can show."""
+    """A request for something that the models cannot show."""
 
 
 class Network(ABC):

@@ -74,7 +74,7 @@ class Server:
         )
         self._thread = ThreadPoolExecutor(1)
         self._jobs: dict[bytes, Job] = {}
-        """That wait or are computed."""
+        """Jobs that wait or are being computed."""
         self._known: OrderedDict[bytes, bytes] = OrderedDict()
         self._waiting: asyncio.Queue[bytes] = asyncio.Queue()
 
