@@ -19,6 +19,15 @@ Isa native_isa() {
   return Isa::kScalar;
 }
 
+bool gathers_quickly() {
+#if defined(__x86_64__)
+  __builtin_cpu_init();
+  return __builtin_cpu_is("intel") && __builtin_cpu_supports("avx512fp16");  // Sapphire Rapids was the first with it
+#else
+  return false;
+#endif
+}
+
 std::string isa_name(Isa isa) {
   switch (isa) {
     case Isa::kAvx512: return "avx512";

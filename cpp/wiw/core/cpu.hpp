@@ -15,6 +15,10 @@ Isa active_isa();
 /// Best set of this processor alone. AVX2 implies FMA and F16C; AVX-512 implies F, DQ, BW and VL.
 Isa native_isa();
 
+/// Whether gather instructions beat separate loads: they are microcode on AMD's processors, and slowed down on Intel's
+/// before Sapphire Rapids against leaks of data between processes.
+bool gathers_quickly();
+
 std::string isa_name(Isa isa);
 
 }  // namespace wiw

@@ -37,9 +37,9 @@ class FlushDenormals {
 #endif
 };
 
-TileKernel kernel_for(Isa isa) {
+TileKernel kernel_for(Isa isa, bool gather) {
 #if defined(__x86_64__)
-  if (isa == Isa::kAvx512) return render_tile_avx512;
+  if (isa == Isa::kAvx512) return gather ? render_tile_avx512_gather : render_tile_avx512;
   if (isa == Isa::kAvx2) return render_tile_avx2;
 #endif
   return render_tile_scalar;
@@ -58,11 +58,11 @@ ImageTargets image_of(const RenderTargets& targets, Size size, std::size_t index
 
 class CpuRenderer final : public Renderer {
  public:
-  CpuRenderer(scene::ScenePtr scene, const RenderOptions& options, Isa isa)
+  CpuRenderer(scene::ScenePtr scene, const RenderOptions& options, Isa isa, bool gather)
       : scene_(std::move(scene)),
         options_(options),
         isa_(isa),
-        kernel_(kernel_for(isa)),
+        kernel_(kernel_for(isa, gather)),
         shading_(*scene_),
         embree_(*scene_, shading_, isa) {
     shading_.describe(kernel_scene_);
@@ -132,14 +132,14 @@ class CpuRenderer final : public Renderer {
 
 }  // namespace
 
-std::shared_ptr<Renderer> make_cpu_renderer(scene::ScenePtr scene, const RenderOptions& options, Isa isa) {
+std::shared_ptr<Renderer> make_cpu_renderer(scene::ScenePtr scene, const RenderOptions& options, Isa isa, bool gather) {
   check_options(options);
   if (isa > native_isa()) {
     throw BackendError("render: this processor has no " + isa_name(isa) + ", only " + isa_name(native_isa()));
   }
   scene->validate();
   if (scene->triangle_count() == 0) throw ArgumentError("render: scene '" + scene->name + "' has no triangles");
-  return std::make_shared<CpuRenderer>(std::move(scene), options, isa);
+  return std::make_shared<CpuRenderer>(std::move(scene), options, isa, gather);
 }
 
 }  // namespace wiw::render

@@ -70,8 +70,7 @@ RTCGeometry EmbreeScene::make_geometry(std::size_t number, const Eigen::Affine3f
   RTCGeometry geometry = rtcNewGeometry(device_, RTC_GEOMETRY_TYPE_TRIANGLE);
   rtcSetNewGeometryBuffer(geometry, RTC_BUFFER_TYPE_VERTEX, 0, RTC_FORMAT_FLOAT3, sizeof(Eigen::Vector3f),
                           mesh.positions.size());
-  rtcSetSharedGeometryBuffer(geometry, RTC_BUFFER_TYPE_INDEX, 0, RTC_FORMAT_UINT3, mesh.triangles.data(), 0,
-                             sizeof(mesh.triangles[0]), mesh.triangles.size());
+  set_triangles(geometry, number);
   write_vertices(geometry, number, T_world_instance);
   if (cutouts_[number].surface->alpha_cutoff >= 0.f) {
     rtcSetGeometryUserData(geometry, &cutouts_[number]);
@@ -80,6 +79,21 @@ RTCGeometry EmbreeScene::make_geometry(std::size_t number, const Eigen::Affine3f
   }
   rtcCommitGeometry(geometry);
   return geometry;
+}
+
+void EmbreeScene::set_triangles(RTCGeometry geometry, std::size_t number) const {
+  const InstanceMesh& part = shading_.parts()[number];
+  const scene::Mesh& mesh = scene_.meshes[part.mesh];
+  const std::size_t count = mesh.triangles.size();
+  if (!shading_.is_reordered(part)) {
+    rtcSetSharedGeometryBuffer(geometry, RTC_BUFFER_TYPE_INDEX, 0, RTC_FORMAT_UINT3, mesh.triangles.data(), 0,
+                               sizeof(scene::Triangle), count);
+    return;
+  }
+  auto* triangles = static_cast<scene::Triangle*>(
+      rtcSetNewGeometryBuffer(geometry, RTC_BUFFER_TYPE_INDEX, 0, RTC_FORMAT_UINT3, sizeof(scene::Triangle), count));
+  if (triangles == nullptr) throw Error("render: out of memory for the scene's triangles");
+  for (std::size_t t = 0; t < count; ++t) triangles[shading_.place_of(part, t)] = mesh.triangles[t];
 }
 
 void EmbreeScene::write_vertices(RTCGeometry geometry, std::size_t number,

@@ -45,6 +45,7 @@ class EmbreeScene {
   void show(std::size_t part, bool from_fixed);
   [[nodiscard]] bool is_home(const MeshPlacement& part) const;
   RTCGeometry make_geometry(std::size_t part, const Eigen::Affine3f& T_world_instance);
+  void set_triangles(RTCGeometry geometry, std::size_t part) const;
   void write_vertices(RTCGeometry geometry, std::size_t part, const Eigen::Affine3f& T_world_instance) const;
   void check(const char* what) const;
 

@@ -39,7 +39,9 @@ inline Detail load_detail(const KernelScene& scene, const Hits& hits) {
   const Ints number = reinterpret_cast<Ints>(hits.record[15]);
   const Ints has = number != static_cast<std::int32_t>(kNoDetail);
   Floats words[kRecordWords];
-  load_lines(scene.details, has ? number : Ints{}, words);
+  alignas(64) std::uint32_t numbers[kLanes];
+  store(numbers, has & number);
+  load_lines(scene.details, numbers, words);
   Detail detail;
   const Floats nx = interpolate(hits, words[0], words[3], words[6]);
   const Floats ny = interpolate(hits, words[1], words[4], words[7]);

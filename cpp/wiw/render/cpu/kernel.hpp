@@ -114,5 +114,8 @@ using TileKernel = void (*)(const KernelScene&, const KernelView&, const ImageTa
 void render_tile_scalar(const KernelScene& scene, const KernelView& view, const ImageTargets& image, const Tile& tile);
 void render_tile_avx2(const KernelScene& scene, const KernelView& view, const ImageTargets& image, const Tile& tile);
 void render_tile_avx512(const KernelScene& scene, const KernelView& view, const ImageTargets& image, const Tile& tile);
+/// The same, reading textures by gather instructions.
+void render_tile_avx512_gather(const KernelScene& scene, const KernelView& view, const ImageTargets& image,
+                               const Tile& tile);
 
 }  // namespace wiw::render::cpu

@@ -62,20 +62,17 @@ inline Ints cast(const KernelScene& scene, const Directions& d, Ints valid, RayH
   return (load_ints(rays.hit.geomID) != -1) & valid;
 }
 
-/// Index of every lane's triangle record; record 0 for lanes without a hit.
-inline Ints record_numbers(const KernelScene& scene, const RayHit& rays, Ints hit) {
-  Ints numbers{};
+/// Number of every lane's triangle record; 0 for lanes without a hit.
+inline void find_records(const KernelScene& scene, const RayHit& rays, Ints hit, std::uint32_t* numbers) {
+  alignas(64) std::uint32_t mask[kLanes];
+  store(mask, hit);
   for (int lane = 0; lane < kLanes; ++lane) {
-    if (hit[lane] == 0) continue;
-    numbers[lane] = static_cast<std::int32_t>(scene.first_record[rays.hit.geomID[lane]] + rays.hit.primID[lane]);
+    const std::uint32_t first = scene.first_record[rays.hit.geomID[lane] & mask[lane]];
+    numbers[lane] = (first + rays.hit.primID[lane]) & mask[lane];
   }
-  return numbers;
 }
 
-inline RgbLanes shade_rays(const KernelScene& scene, const Directions& d, const RayHit& rays, Ints hit, Floats spread) {
-  RgbLanes color{};
-  if (mask_bits(~hit) != 0) color = sky(scene, d);
-  if (mask_bits(hit) == 0) return color;
+inline Hits load_hits(const KernelScene& scene, const Directions& d, const RayHit& rays, Ints hit, Floats spread) {
   Hits hits;
   hits.rays = &rays;
   hits.u = load_floats(rays.hit.u);
@@ -87,7 +84,16 @@ inline RgbLanes shade_rays(const KernelScene& scene, const Directions& d, const 
   hits.d = d;
   hits.spread = spread;
   hits.hit = hit;
-  load_lines(scene.records, record_numbers(scene, rays, hit), hits.record);
+  alignas(64) std::uint32_t numbers[kLanes];
+  find_records(scene, rays, hit, numbers);
+  load_lines(scene.records, numbers, hits.record);
+  return hits;
+}
+
+inline RgbLanes shade_rays(const KernelScene& scene, const Hits& hits) {
+  RgbLanes color{};
+  if (mask_bits(~hits.hit) != 0) color = sky(scene, hits.d);
+  if (mask_bits(hits.hit) == 0) return color;
   return shade_hits(scene, hits, color);
 }
 
@@ -98,7 +104,7 @@ inline RgbLanes supersample(const KernelScene& scene, const KernelView& view, in
     const RayGrid& grid = view.samples[i];
     const Directions d = directions(view, grid, x, y);
     const Ints hit = cast(scene, d, valid, rays);
-    const RgbLanes color = shade_rays(scene, d, rays, hit, rows_of(grid.row_spread + y));
+    const RgbLanes color = shade_rays(scene, load_hits(scene, d, rays, hit, rows_of(grid.row_spread + y)));
     sum = {sum.r + color.r, sum.g + color.g, sum.b + color.b};
   }
   const float weight = 1.f / static_cast<float>(view.sample_count);
@@ -120,11 +126,15 @@ inline void write_color(const ImageTargets& image, const PacketPlace& place, con
   for (int row = 0; row < place.rows; ++row) {
     const std::uint32_t* p = pixels + kPacketWidth * row;
     std::uint8_t* out = image.color + 3 * (place.first + static_cast<std::size_t>(row) * place.stride);
-    const std::uint32_t words[3] = {p[0] | (p[1] << 24), (p[1] >> 8) | (p[2] << 16), (p[2] >> 16) | (p[3] << 8)};
+    const std::uint64_t first = p[0] | (std::uint64_t{p[1]} << 24) | (std::uint64_t{p[2]} << 48);
+    const std::uint32_t last = (p[2] >> 16) | (p[3] << 8);
     if (place.columns == kPacketWidth) {
-      __builtin_memcpy(out, words, sizeof words);
-    } else {
-      __builtin_memcpy(out, words, 3 * static_cast<std::size_t>(place.columns));
+      __builtin_memcpy(out, &first, sizeof first);
+      __builtin_memcpy(out + sizeof first, &last, sizeof last);
+    } else {  // at most three pixels
+      for (int i = 0; i < 3 * place.columns; ++i) {
+        out[i] = static_cast<std::uint8_t>(i < 8 ? first >> (8 * i) : last);
+      }
     }
   }
 }
@@ -144,14 +154,10 @@ inline void write_words(void* target, const PacketPlace& place, Pixels values) {
 }
 
 inline Ints instance_ids(const KernelScene& scene, const RayHit& rays, Ints hit) {
-  const Ints numbers = record_numbers(scene, rays, hit);
-  Ints ids{};
-  for (int lane = 0; lane < kLanes; ++lane) {
-    if (hit[lane] != 0) {
-      ids[lane] = static_cast<std::int32_t>(scene.records[static_cast<std::uint32_t>(numbers[lane])].instance);
-    }
-  }
-  return ids;
+  alignas(64) std::uint32_t numbers[kLanes];
+  find_records(scene, rays, hit, numbers);
+  for (int lane = 0; lane < kLanes; ++lane) numbers[lane] = scene.records[numbers[lane]].instance;
+  return load_ints(numbers) & hit;
 }
 
 inline void draw_packet(const KernelScene& scene, const KernelView& view, const ImageTargets& image, int x, int y,
@@ -167,12 +173,15 @@ inline void draw_packet(const KernelScene& scene, const KernelView& view, const 
     const Directions d = directions(view, view.center, x, y);
     const Ints hit = cast(scene, d, valid, rays);
     if (image.color != nullptr && one_sample) {
-      write_color(image, place, shade_rays(scene, d, rays, hit, rows_of(view.center.row_spread + y)));
+      const Hits hits = load_hits(scene, d, rays, hit, rows_of(view.center.row_spread + y));
+      write_color(image, place, shade_rays(scene, hits));
+      if (image.instance != nullptr) write_words(image.instance, place, reinterpret_cast<Ints>(hits.record[13]) & hit);
+    } else if (image.instance != nullptr) {
+      write_words(image.instance, place, instance_ids(scene, rays, hit));
     }
     if (image.depth != nullptr) {
       write_words(image.depth, place, hit ? load_floats(rays.ray.tfar) : Floats{});
     }
-    if (image.instance != nullptr) write_words(image.instance, place, instance_ids(scene, rays, hit));
   }
   if (image.color != nullptr && !one_sample) write_color(image, place, supersample(scene, view, x, y, valid, rays));
 }

@@ -9,6 +9,7 @@
 #include "wiw/core/error.hpp"
 #include "wiw/core/thread_pool.hpp"
 #include "wiw/render/bulge.hpp"
+#include "wiw/render/cpu/record_order.hpp"
 #include "wiw/render/texel_density.hpp"
 
 namespace wiw::render::cpu {
@@ -89,18 +90,22 @@ ShadingScene::ShadingScene(const scene::Scene& scene) : scene_(scene) {
     sun_.ambient = scene_.sun->ambient;
   }
   add_parts();
+  orders_.resize(scene_.meshes.size());
+  parallel_for(orders_.size(), [this](std::size_t i) { orders_[i] = spatial_order(scene_.meshes[i]); });
   stretches_.resize(parts_.size());
   parallel_for(parts_.size(), [this](std::size_t i) {
     const InstanceMesh& part = parts_[i];
     const scene::Instance& instance = scene_.instances[part.instance];
     const scene::Mesh& mesh = scene_.meshes[part.mesh];
     for (std::size_t t = 0; t < mesh.triangles.size(); ++t) {
-      TriangleRecord& record = records_[part.first_record + t];
+      const std::size_t number = place_of(part, t);
+      TriangleRecord& record = records_[part.first_record + number];
       write_differences(mesh.uv, mesh.triangles[t], record.uv);
       write_differences(mesh.lightmap_uv, mesh.triangles[t], record.light_uv);
       record.surface = part.surface;
       record.instance = instance.id;
-      record.detail = part.first_detail == kNoDetail ? kNoDetail : part.first_detail + static_cast<std::uint32_t>(t);
+      record.detail =
+          part.first_detail == kNoDetail ? kNoDetail : part.first_detail + static_cast<std::uint32_t>(number);
       if (mesh.colors.empty() || part.first_detail == kNoDetail) continue;
       for (int k = 0; k < 3; ++k) {
         std::memcpy(&details_[record.detail].color[k], mesh.colors[mesh.triangles[t][k]].data(), 4);
@@ -168,7 +173,7 @@ void ShadingScene::place(std::size_t number, const Eigen::Affine3f& T_world_inst
   if (part.first_detail == kNoDetail || mesh.normals.empty()) return;
   const Normals normals = normals_of(mesh, T_world_instance.linear());
   for (std::size_t t = 0; t < mesh.triangles.size(); ++t) {
-    write_normals(mesh.triangles[t], normals, details_[part.first_detail + t].normal);
+    write_normals(mesh.triangles[t], normals, details_[part.first_detail + place_of(part, t)].normal);
   }
   if (scene_.sun) place_bulges(number, T_world_instance.linear());
 }
@@ -181,7 +186,7 @@ void ShadingScene::place_texels(std::size_t number, const Eigen::Matrix3f& linea
   const Eigen::Vector2f size(texture->width[0], texture->height[0]);
   for (std::size_t t = 0; t < mesh.triangles.size(); ++t) {
     const scene::Triangle& triangle = mesh.triangles[t];
-    TriangleRecord& record = records_[part.first_record + t];
+    TriangleRecord& record = records_[part.first_record + place_of(part, t)];
     const Eigen::Vector3f first = mesh.positions[triangle[0]];
     const Eigen::Vector3f to_1 = linear * (mesh.positions[triangle[1]] - first);
     const Eigen::Vector3f to_2 = linear * (mesh.positions[triangle[2]] - first);
@@ -201,7 +206,7 @@ void ShadingScene::place_bulges(std::size_t number, const Eigen::Matrix3f& linea
   const scene::Mesh& mesh = scene_.meshes[part.mesh];
   const Normals normals = normals_of(mesh, stretch);
   for (std::size_t t = 0; t < mesh.triangles.size(); ++t) {
-    details_[part.first_detail + t].bulge = bulge_of(mesh, mesh.triangles[t], stretch, normals);
+    details_[part.first_detail + place_of(part, t)].bulge = bulge_of(mesh, mesh.triangles[t], stretch, normals);
   }
 }
 

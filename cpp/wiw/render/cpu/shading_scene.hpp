@@ -31,6 +31,13 @@ class ShadingScene {
     return records_.data() + part.first_record;
   }
 
+  /// Number of a triangle's record among its part's. Its details and its primitive of Embree have the same one.
+  [[nodiscard]] std::size_t place_of(const InstanceMesh& part, std::size_t triangle) const {
+    const std::vector<std::uint32_t>& order = orders_[part.mesh];
+    return order.empty() ? triangle : order[triangle];
+  }
+  [[nodiscard]] bool is_reordered(const InstanceMesh& part) const { return !orders_[part.mesh].empty(); }
+
   /// Recomputes what depends on a part's pose: world normals, bulges and texel densities.
   void place(std::size_t part, const Eigen::Affine3f& T_world_instance);
 
@@ -53,6 +60,7 @@ class ShadingScene {
   std::vector<InstanceMesh> parts_;
   std::vector<std::uint32_t> first_record_;  // by part
   std::vector<TriangleRecord> records_;
+  std::vector<std::vector<std::uint32_t>> orders_;  // by mesh: places of its triangles; empty: their own
   std::vector<TriangleDetail> details_;
   std::vector<std::optional<Eigen::Matrix3f>> stretches_;  // by part: what its bulges are of
 };

@@ -84,13 +84,12 @@ inline void transpose(__m256 rows[8]) {
 }
 
 /// words[k] = word k of every lane's 64-byte line.
-inline void load_lines(const void* lines, Ints index, Floats* words) {
+inline void load_lines(const void* lines, const std::uint32_t* index, Floats* words) {
   const auto* base = static_cast<const float*>(lines);
   for (int half = 0; half < 2; ++half) {
     __m256 rows[8];
     for (int lane = 0; lane < kLanes; ++lane) {
-      const auto line = static_cast<std::size_t>(static_cast<std::uint32_t>(index[lane]));
-      rows[lane] = _mm256_load_ps(base + line * kRecordWords + 8 * half);
+      rows[lane] = _mm256_load_ps(base + std::size_t{index[lane]} * kRecordWords + 8 * half);
     }
     transpose(rows);
     for (int k = 0; k < 8; ++k) words[8 * half + k] = (Floats)rows[k];

@@ -44,7 +44,8 @@ inline Ints look_up(const std::int32_t* table, Ints index) {
   return (Ints)_mm512_permutexvar_epi32((__m512i)index, _mm512_loadu_si512(table));
 }
 
-/// The texel pairs of lanes a and b. Separate loads beat gather instructions, which are microcode on many processors.
+#ifndef WIW_RENDER_GATHER
+/// The texel pairs of lanes a and b.
 inline __m128i two_pairs(const std::uint32_t* texels, std::int32_t a, std::int32_t b) {
   const __m128i low = _mm_loadl_epi64(reinterpret_cast<const __m128i*>(texels + a));  // pairs lie at any texel
   return _mm_castpd_si128(_mm_loadh_pd(_mm_castsi128_pd(low), reinterpret_cast<const double*>(texels + b)));
@@ -57,13 +58,20 @@ inline __m512i eight_pairs(const std::uint32_t* texels, const std::int32_t* inde
   high = _mm256_inserti128_si256(high, two_pairs(texels, index[6], index[7]), 1);
   return _mm512_inserti64x4(pairs, high, 1);
 }
+#endif
 
-/// Texels `index` and `index + 1` of every lane.
+/// Texels `index` and `index + 1` of every lane. Gather instructions are microcode on many processors, where separate
+/// loads beat them (wiw::gathers_quickly).
 inline void load_pairs(const std::uint32_t* texels, Ints index, Ints& left, Ints& right) {
+#ifdef WIW_RENDER_GATHER
+  const __m512i low = _mm512_i32gather_epi64(_mm512_castsi512_si256((__m512i)index), texels, 4);
+  const __m512i high = _mm512_i32gather_epi64(_mm512_extracti64x4_epi64((__m512i)index, 1), texels, 4);
+#else
   alignas(64) std::int32_t indices[kLanes];
   _mm512_store_si512(indices, (__m512i)index);
   const __m512i low = eight_pairs(texels, indices);
   const __m512i high = eight_pairs(texels, indices + 8);
+#endif
   const __m512i even = _mm512_setr_epi32(0, 2, 4, 6, 8, 10, 12, 14, 16, 18, 20, 22, 24, 26, 28, 30);
   const __m512i odd = _mm512_setr_epi32(1, 3, 5, 7, 9, 11, 13, 15, 17, 19, 21, 23, 25, 27, 29, 31);
   left = (Ints)_mm512_permutex2var_epi32(low, even, high);
@@ -71,12 +79,11 @@ inline void load_pairs(const std::uint32_t* texels, Ints index, Ints& left, Ints
 }
 
 /// words[k] = word k of every lane's 64-byte line: a 16 x 16 transpose in four butterfly steps.
-inline void load_lines(const void* lines, Ints index, Floats* words) {
+inline void load_lines(const void* lines, const std::uint32_t* index, Floats* words) {
   const auto* base = static_cast<const float*>(lines);
   __m512 rows[16];
   for (int lane = 0; lane < kLanes; ++lane) {
-    const auto line = static_cast<std::size_t>(static_cast<std::uint32_t>(index[lane]));
-    rows[lane] = _mm512_load_ps(base + line * kRecordWords);
+    rows[lane] = _mm512_load_ps(base + std::size_t{index[lane]} * kRecordWords);
   }
   __m512 quads[16];  // quads[4 g + k]: word k of every 4-word block, for the four lanes 4 g ...
   for (int g = 0; g < 4; ++g) {

@@ -55,11 +55,9 @@ inline void load_pairs(const std::uint32_t* texels, Ints index, Ints& left, Ints
 }
 
 /// words[k] = word k of every lane's 64-byte line.
-inline void load_lines(const void* lines, Ints index, Floats* words) {
+inline void load_lines(const void* lines, const std::uint32_t* index, Floats* words) {
   const auto* base = static_cast<const float*>(lines);
-  const auto line = [&](int lane) {
-    return base + static_cast<std::size_t>(static_cast<std::uint32_t>(index[lane])) * kRecordWords;
-  };
+  const auto line = [&](int lane) { return base + std::size_t{index[lane]} * kRecordWords; };
   const float *a = line(0), *b = line(1), *c = line(2), *d = line(3);
   for (int k = 0; k < kRecordWords; ++k) words[k] = Floats{a[k], b[k], c[k], d[k]};
 }
