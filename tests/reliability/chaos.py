@@ -112,8 +112,8 @@ def run_chaos(folder: Path, episodes: int, shards: int, period: float, seed: int
         parts = [Shard(f"{i}/{shards}", disk / str(i), command) for i in range(1, shards + 1)]
         done = disturb(parts, disk, period, random.Random(seed))
         for part in parts:  # episodes that broke on a full disk or a lost process, as a user runs them again
-            again = [*WIW, "resume", str(part.out), "--retry-errors", "--no-report", "--no-progress"]
-            subprocess.run(again, check=True, stdout=subprocess.DEVNULL)
+            again = [*WIW, "resume", str(part.out), "--retry-errors", "--no-report"]
+            subprocess.run(again, check=True, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL)
             whole(part.out)
         merged = wiw.merge([part.out for part in parts], folder / "merged")
     (rows, config), (expected, begun) = read_rows(folder / "merged"), read_rows(folder / "quiet")
