@@ -3,11 +3,11 @@
 
 from __future__ import annotations
 
-import json
 from pathlib import Path
 from typing import Any
 
 from wiw.errors import FileError
+from wiw.json_text import parse_json
 
 
 def read_yaml_mapping(path: Path, expected: str) -> dict[str, Any]:
@@ -23,12 +23,27 @@ def read_yaml_mapping(path: Path, expected: str) -> dict[str, Any]:
     import yaml
 
     try:
-        content = yaml.safe_load(path.read_text(encoding="utf-8"))
+        content = parse_yaml(path.read_text(encoding="utf-8"))
     except (OSError, ValueError, yaml.YAMLError) as error:
         raise FileError(f"{path}: expected {expected}, got {error}") from error
     if not isinstance(content, dict):
         raise FileError(f"{path}: expected {expected}, got {type(content).__name__}")
     return content
+
+
+def parse_yaml(text: str) -> Any:
+    """Return the value of a YAML text.
+
+    Raises:
+        ValueError: its lists and mappings are nested too deeply.
+        yaml.YAMLError: it is no YAML.
+    """
+    import yaml
+
+    try:
+        return yaml.safe_load(text)
+    except RecursionError:
+        raise ValueError("expected lists and mappings that are nested less deeply") from None
 
 
 def read_json_object(path: Path, expected: str) -> dict[str, Any]:
@@ -42,7 +57,7 @@ def read_json_object(path: Path, expected: str) -> dict[str, Any]:
         FileError: it is missing, cannot be read, is no JSON, or no object.
     """
     try:
-        found = json.loads(path.read_text(encoding="utf-8"))
+        found = parse_json(path.read_text(encoding="utf-8"))
         if not isinstance(found, dict):
             raise ValueError("no object")
         return found

@@ -1,6 +1,7 @@
 /* SPDX-License-Identifier: Apache-2.0 */
 /* Makes one call of the operating system that writes below a folder fail, whichever library makes it: SQLite, Arrow,
- * torch, Python. Loaded by LD_PRELOAD; a process arms it with fail_write. What C's own FILE writes is not seen. */
+ * torch, Python. Loaded by LD_PRELOAD; a process arms it with fail_write. What C's own FILE writes is not seen.
+ * Makes the clock jump too. */
 #define _GNU_SOURCE
 #include <dlfcn.h>
 #include <errno.h>
@@ -12,7 +13,9 @@
 #include <stdio.h>
 #include <string.h>
 #include <sys/stat.h>
+#include <sys/time.h>
 #include <sys/uio.h>
+#include <time.h>
 #include <unistd.h>
 
 enum { FULL, IO_ERROR, TORN, CUT }; /* TORN: half is written, then an error; CUT: half is written, then a kill */
@@ -91,6 +94,23 @@ int ftruncate(int file, off_t size) { FORWARD(ftruncate, fails_at(file), file, s
 int ftruncate64(int file, off64_t size) { return ftruncate(file, size); }
 int rename(const char* from, const char* to) { FORWARD(rename, fails(to), from, to); }
 int mkdir(const char* path, mode_t mode) { FORWARD(mkdir, fails(path), path, mode); }
+
+static atomic_long jump;
+
+/* The time of day is so many seconds off from now on. */
+void jump_clock(long seconds) { atomic_store(&jump, seconds); }
+
+int clock_gettime(clockid_t clock, struct timespec* now) {
+  int result = REAL(clock_gettime)(clock, now);
+  if (clock == CLOCK_REALTIME) now->tv_sec += atomic_load(&jump);
+  return result;
+}
+
+int gettimeofday(struct timeval* restrict now, void* restrict zone) {
+  int result = REAL(gettimeofday)(now, zone);
+  now->tv_sec += atomic_load(&jump);
+  return result;
+}
 
 static int open_file(const char* path, int flags, va_list rest) {
   mode_t mode = flags & (O_CREAT | O_TMPFILE) ? va_arg(rest, mode_t) : 0;

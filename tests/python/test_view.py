@@ -23,6 +23,9 @@ from wiw.studies.evaluate import run_arms
 from wiw.types import Episode
 
 EVIL = """<img src=x onerror="document.title='owned'">'"/../&"""
+HOSTILE = (
+    EVIL + """</title></textarea></style></script><script>window.owned=1</script><img src=x onerror="window.owned=1">"""
+)
 ARMS = ("none", "warp", EVIL)
 
 
@@ -227,3 +230,27 @@ def test_a_failed_episode_shows_its_error_in_a_browser(site, browser):
     text = browser.ask("document.body.innerText")
     assert "no such scene" in text and EVIL in text
     assert browser.ask("document.querySelectorAll('img').length") == 0
+
+
+def test_a_hostile_run_runs_no_script_in_a_browser(tmp_path, browser):
+    """Whatever text a run holds, of names, notes, questions, replies and errors, is markup that would call `owned`."""
+    arms = {EVIL: LineAgent(0.4), "b": LineAgent(0.9)}
+    log = run_arms(EvilTask(broken=("0001",)), arms, 3, out=tmp_path / "run", progress=False, keep_images="all")
+    exchange = dict.fromkeys(("purpose", "model", "problem", "instead"), HOSTILE)
+    exchange |= {"said": [{"call": HOSTILE, "text": HOSTILE, "finish": HOSTILE}], "result": {"by": HOSTILE}}
+    details = dict.fromkeys(("question", "answer", "given", "believed", "category", HOSTILE), HOSTILE)
+    with sqlite3.connect(store_path(tmp_path / "run")) as store:
+        proposals = json.dumps([{"actions": [1], "prior": 0.5, "note": HOSTILE}] * 2)
+        store.execute("UPDATE decision SET note = ?, proposals = ?", (HOSTILE, proposals))
+        store.execute("UPDATE decision SET exchanges = ?", (json.dumps([exchange]),))
+        store.execute("UPDATE outcome SET error = ?, details = ?", (HOSTILE, json.dumps(details)))
+        store.execute("UPDATE episode SET info = ?", (json.dumps(details),))
+    made = [write_view(log, tmp_path / "view").index, log.report(tmp_path / "report.html")]
+    for file in (*pages(write_view(log, tmp_path / "again")), *made):
+        browser.open(file.as_uri())
+        assert browser.ask("typeof window.owned") == "undefined" and browser.ask("document.title") != "owned", file
+        assert browser.ask("document.querySelectorAll('script').length") == 1, file
+        assert "owned" in browser.ask("document.body.innerText"), "the text is shown"
+    can_run = "document.body.innerHTML = document.body.innerText; new Promise(done => setTimeout(done, 200))"
+    browser.ask(can_run)
+    assert browser.ask("typeof window.owned") == "number", "the text would run if it were markup"

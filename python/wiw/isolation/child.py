@@ -59,7 +59,7 @@ def main() -> None:
     faulthandler.enable()
     sys.argv[:] = ["wiw"]
     data, _ = receive(connection)
-    sys.path[:], folder = pickle.loads(data)  # from the parent, as all that is pickled here
+    sys.path[:], folder = pickle.loads(data)  # noqa: S301 - from the parent, as all that is pickled here
     os.chdir(folder)
     send(connection, msgpack.packb({}))
     with suppress(EOFError, BrokenPipeError, ConnectionResetError):
@@ -71,7 +71,7 @@ def _serve(connection: socket.socket) -> None:
     host, memories = Host(), dict[int, mmap.mmap]()
     while True:
         data, descriptors = receive(connection)
-        head, body = pickle.loads(data)
+        head, body = pickle.loads(data)  # noqa: S301
         memories |= {name: map_segment(each) for name, each in zip(head["new"], descriptors, strict=True)}
         for name in memories.keys() - set(head["kept"]):
             del memories[name]
@@ -99,7 +99,7 @@ def _answer(
 
 def _call(host: Host, body: bytes, arrays: list[NDArray[np.uint8]]) -> dict[str, Any]:
     try:
-        function, arguments = pickle.loads(body, buffers=arrays)
+        function, arguments = pickle.loads(body, buffers=arrays)  # noqa: S301
         value = function(host, *arguments)
         del arguments
         return {"value": value}

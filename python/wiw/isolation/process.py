@@ -290,5 +290,8 @@ def _build_error(told: Any) -> Exception:
     own = getattr(errors, name, None) if name in errors.__all__ and name != "is_stop_request" else None
     if own is None:
         return RaisedError(text)
-    error: Exception = own(text, kind) if isinstance(kind, str) else own(text)
+    try:
+        error: Exception = own(text, kind) if isinstance(kind, str) else own(text)
+    except TypeError:  # it takes more than the child has told
+        return RaisedError(text)
     return error

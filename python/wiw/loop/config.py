@@ -5,6 +5,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass, fields, replace
+from numbers import Integral
 from typing import Annotated, Any
 
 from tyro.conf import Suppress, arg
@@ -50,8 +51,10 @@ class AgentConfig(PlanConfig):
     def __post_init__(self) -> None:
         for name in ("candidates", "horizon", "depth", "width", "pool"):
             value = getattr(self, name)
-            if value is not None and value < 1:
+            if value is not None and not (isinstance(value, Integral) and value >= 1):
                 raise ArgumentError(f"agent: expected {name} of at least 1, got {value}")
+        if not isinstance(self.execute, Integral | None):
+            raise ArgumentError(f"agent: expected execute as a whole number, got {self.execute!r}")
         if self.execute is not None and self.horizon is not None and abs(self.execute) > self.horizon:
             raise ArgumentError(
                 f"agent: expected execute from -horizon to horizon, got execute={self.execute}, horizon={self.horizon}"

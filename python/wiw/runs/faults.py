@@ -26,6 +26,8 @@ def explain_faults(path: Path, home: Path | None = None) -> Iterator[None]:
         yield
     except sqlite3.DatabaseError as error:
         raise StoreError(f"{path}: {error}; {find_remedy(path, str(error), home)}") from error
+    except UnicodeDecodeError as error:  # of SQLite's own message, which quotes the file
+        raise StoreError(f"{path}: {error}; {find_remedy(path, 'malformed', home)}") from error
 
 
 def find_remedy(path: Path, error: str, home: Path | None = None) -> str:

@@ -12,9 +12,10 @@ import json
 import math
 import sqlite3
 from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
-from contextlib import ExitStack, contextmanager, suppress
+from contextlib import ExitStack, closing, contextmanager, suppress
 from dataclasses import asdict
 from datetime import datetime, timezone
+from functools import cache
 from pathlib import Path
 from typing import Any
 
@@ -270,6 +271,19 @@ class RunStore:
                 f"{wiw.__version__}, which reads versions {OLDEST_READABLE} to {SCHEMA_VERSION}: use the one that "
                 "wrote it, or start a new run"
             )
+        if version == SCHEMA_VERSION:
+            self._require_columns()
+
+    def _require_columns(self) -> None:
+        """Check that the tables have the columns that this version writes: a damaged schema may still be SQL."""
+        for table, columns in _list_columns().items():
+            found = {row["name"]: row["type"] for row in self._rows(f"PRAGMA main.table_info({table})")}
+            if not columns.items() <= found.items():
+                wrong = next(name for name in columns if found.get(name) != columns[name])
+                raise StoreError(
+                    f"{self.path}: table {table}: expected a column {wrong} {columns[wrong]}, got "
+                    f"{found.get(wrong, 'none')}; {find_remedy(self.path, 'malformed')}"
+                )
 
     def _update_schema(self) -> None:
         """Bring an older store to the current schema: in the file if it may be written, else for this reader alone."""
@@ -730,6 +744,17 @@ class RunStore:
         if not rows:
             raise StoreError(f"{self.path} is damaged: it does not say which run it holds")
         return rows[0][column]
+
+
+@cache
+def _list_columns() -> dict[str, dict[str, str]]:
+    """Return the columns of each table of a store, with the types that its schema names."""
+    with closing(sqlite3.connect(":memory:")) as connection:
+        connection.executescript(_SCHEMA.read_text())
+        tables = [name for (name,) in connection.execute("SELECT name FROM sqlite_master WHERE type = 'table'")]
+        return {
+            table: {row[1]: row[2] for row in connection.execute(f"PRAGMA table_info({table})")} for table in tables
+        }
 
 
 @contextmanager

@@ -27,6 +27,7 @@ from tyro.conf import arg
 
 from wiw.errors import ArgumentError, DependencyError, InfrastructureError, StoreError
 from wiw.files import atomic_file
+from wiw.json_text import parse_json
 
 SIGNAL_DELAY = 90
 """Seconds before the time limit at which SLURM sends SIGUSR2."""
@@ -274,7 +275,7 @@ def cancel(run: str | Path) -> list[SubmittedJob]:
 
 
 def _parse(path: Path) -> list[Mapping[str, Any]]:
-    return list(json.loads(path.read_text()))
+    return list(parse_json(path.read_text()))
 
 
 def _write_jobs(folder: Path, jobs: Sequence[SubmittedJob]) -> None:

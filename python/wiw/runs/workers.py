@@ -352,7 +352,7 @@ def unpickle_spec(data: bytes) -> WorkerSpec:
         InfrastructureError: task or agent cannot be built again there.
     """
     try:
-        return pickle.loads(data)  # made by the parent process
+        return pickle.loads(data)  # noqa: S301 - made by the parent process
     except Exception as error:
         raise InfrastructureError(
             f"task or agent cannot be built again in a worker process ({error}); define its class in a file and give "
@@ -364,7 +364,7 @@ def make_portable(error: Exception) -> Exception:
     """Return the exception itself where it survives pickling and is ours; else its text."""
     if isinstance(error, Error):
         try:
-            pickle.loads(pickle.dumps(error))
+            pickle.loads(pickle.dumps(error))  # noqa: S301 - our own
             return error
         except Exception:
             return InfrastructureError(str(error))

@@ -8,6 +8,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 
 from wiw.errors import FileError
+from wiw.mapping_files import parse_yaml
 
 
 @dataclass(frozen=True)
@@ -31,7 +32,7 @@ class Prices:
         import yaml
 
         try:
-            content = yaml.safe_load(Path(path).expanduser().read_text(encoding="utf-8"))
+            content = parse_yaml(Path(path).expanduser().read_text(encoding="utf-8"))
             return cls({str(model): (float(read), float(written)) for model, (read, written) in content.items()})
         except (OSError, UnicodeDecodeError, yaml.YAMLError, AttributeError, TypeError, ValueError) as error:
             raise FileError(

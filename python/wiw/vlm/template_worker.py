@@ -81,7 +81,7 @@ def serve() -> None:
     resource.setrlimit(resource.RLIMIT_AS, (MEMORY, MEMORY))
     while True:
         try:
-            job = pickle.load(sys.stdin.buffer)
+            job = pickle.load(sys.stdin.buffer)  # noqa: S301 - from the parent
         except EOFError:
             return
         signal.setitimer(signal.ITIMER_PROF, SECONDS)  # its signal ends the process

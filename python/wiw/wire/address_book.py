@@ -14,6 +14,7 @@ from dataclasses import asdict, dataclass
 from pathlib import Path
 
 from wiw.files import atomic_file
+from wiw.json_text import parse_json
 
 
 @dataclass(frozen=True)
@@ -48,5 +49,5 @@ def read_addresses(place: Path) -> list[ServerAddress]:
     found = []
     for file in files:
         with suppress(OSError, ValueError, TypeError):  # gone just now, or no announcement
-            found.append(ServerAddress(**json.loads(file.read_text())))
+            found.append(ServerAddress(**parse_json(file.read_text())))
     return found

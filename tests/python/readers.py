@@ -1,0 +1,356 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Everything that reads bytes which strangers may have made, with a whole sample for each, and ways of damage."""
+
+from __future__ import annotations
+
+import gzip
+import json
+import random
+import shutil
+import socket
+import struct
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+from tempfile import TemporaryDirectory
+from typing import Any
+
+import msgpack
+import numpy as np
+import yaml
+
+import wiw
+from wiw import _core
+from wiw.errors import Error
+
+Read = Callable[[bytes, Path], Any]
+"""Reads bytes, for which it may use a folder."""
+Mutate = Callable[[bytes, random.Random], bytes]
+CONFIGS = Path(wiw.__file__).parent / "configs"
+
+
+@dataclass(frozen=True)
+class Reader:
+    """A reader, which takes bytes or refuses them by an error of wiw's or of the kinds named."""
+
+    make_sample: Callable[[Path], bytes]
+    read: Read
+    structure: str = ""
+    """The format in which values may be exchanged with the whole still well-formed: json, yaml, msgpack or glb."""
+    refusals: tuple[type[BaseException], ...] = ()
+    """Errors beyond wiw's own that its caller expects."""
+
+    def refuses(self, error: BaseException) -> bool:
+        return isinstance(error, (Error, *self.refusals))
+
+
+# -- damage ------------------------------------------------------------------------------------------------------------
+
+
+def damage(data: bytes, draw: random.Random, structure: str) -> bytes:
+    """Return the bytes with one to four changes, half of them within the structure where there is one."""
+    from test_damaged_files import mutate
+
+    return STRUCTURES[structure](data, draw) if structure and draw.random() < 0.5 else mutate(data, draw)
+
+
+def damage_json(data: bytes, draw: random.Random) -> bytes:
+    from test_episode_files_mutated import as_json, change_value
+
+    return as_json(change_value(json.loads(data), draw))
+
+
+def damage_yaml(data: bytes, draw: random.Random) -> bytes:
+    return damage_json(json.dumps(yaml.safe_load(data)).encode(), draw)  # JSON is YAML
+
+
+def damage_msgpack(data: bytes, draw: random.Random) -> bytes:
+    from test_episode_files_mutated import change_value
+
+    changed = change_value(msgpack.unpackb(data, strict_map_key=False), draw)
+    try:
+        return bytes(msgpack.packb(changed))
+    except (OverflowError, ValueError, UnicodeEncodeError):  # a number or a depth that it has not
+        return data[: draw.randrange(len(data))]
+
+
+def damage_glb(data: bytes, draw: random.Random) -> bytes:
+    """Change a value of the document, and leave lengths and the other chunk as they must be."""
+    (length,) = struct.unpack_from("<I", data, 12)
+    document = damage_json(data[20 : 20 + length], draw)
+    document += b" " * (-len(document) % 4)
+    chunks = struct.pack("<II", len(document), 0x4E4F534A) + document + data[20 + length :]
+    return struct.pack("<4sII", b"glTF", 2, 12 + len(chunks)) + chunks
+
+
+STRUCTURES: dict[str, Mutate] = {
+    "json": damage_json,
+    "yaml": damage_yaml,
+    "msgpack": damage_msgpack,
+    "glb": damage_glb,
+}
+
+
+# -- readers -----------------------------------------------------------------------------------------------------------
+
+
+def from_file(name: str, read: Callable[[Path], Any]) -> Read:
+    """Return a reader of bytes, given one of files of such a name."""
+
+    def read_bytes(data: bytes, folder: Path) -> Any:
+        (folder / name).write_bytes(data)
+        return read(folder / name)
+
+    return read_bytes
+
+
+def write_and_take(name: str, write: Callable[[Path], Any]) -> Callable[[Path], bytes]:
+    """Return the bytes of a file that `write` makes."""
+
+    def make(folder: Path) -> bytes:
+        write(folder / name)
+        return (folder / name).read_bytes()
+
+    return make
+
+
+def make_navmesh(path: Path) -> None:
+    floor = np.array([[0, 0, 0], [4, 0, 0], [4, 0, 4], [0, 0, 4]], np.float32)
+    wiw.nav.NavMesh.from_triangles(floor, np.array([[0, 2, 1], [0, 3, 2]])).save(path)
+
+
+def read_navmesh(path: Path) -> Any:
+    mesh = wiw.nav.NavMesh.load(path)
+    mesh.triangles()
+    return mesh.distance_matrix(np.array([[1, 0, 1], [3, 0, 3]], np.float32))
+
+
+def make_scene_cache(path: Path) -> None:
+    from test_damaged_files import PLY, plain
+
+    path.with_suffix(".ply").write_bytes(PLY)
+    _core.scene.write_cache(plain(path.with_suffix(".ply")), path)
+
+
+def read_scene_cache(path: Path) -> Any:
+    scene = _core.scene.map_cache(path)
+    return scene.describe(), scene.bounds
+
+
+def make_frames(path: Path) -> None:
+    from test_navigation_data import made_up
+
+    from wiw.datasets.navigation_files import build_table, navigation_schema, write_frames
+
+    schema = navigation_schema(True, {})
+    write_frames(path, schema, [build_table(made_up(np.random.default_rng(0), 3, 1, True, True), schema)])
+
+
+def read_frames(path: Path) -> Any:
+    from wiw.datasets.navigation_files import FrameFile
+
+    return FrameFile(path).read_segment(0)
+
+
+def make_weights(path: Path) -> None:
+    from wiw.policies.navigator import weights
+    from wiw.policies.navigator.network import Network
+
+    weights.save(path, Network(8, 2), {"scenes": "none"})
+
+
+def read_weights(path: Path) -> Any:
+    from wiw.policies.navigator import weights
+
+    return weights.load(path)
+
+
+def make_store(path: Path) -> None:
+    from crash_victims import evaluate
+
+    with TemporaryDirectory(dir=path.parent) as folder:
+        evaluate(f"{folder}/run", episodes=1, keep_images=0)
+        shutil.copy(f"{folder}/run/run.sqlite", path)
+
+
+def read_store(path: Path) -> Any:
+    from wiw.studies.run_log import load_run
+
+    log = load_run(path)
+    try:
+        store = log.store
+        keys = [(row["arm"], row["episode"], row["decision"]) for row in store.decisions()]
+        return store.outcomes(), store.episodes(), store.info, store.judges, [store.images(*key) for key in keys]
+    finally:
+        log.close()
+
+
+def make_questions(path: Path) -> None:
+    from test_openeqa import ITEM
+
+    path.write_text(json.dumps([ITEM]))
+
+
+def read_questions(path: Path) -> Any:
+    from wiw.datasets.questions import openeqa
+
+    return openeqa.load(path)
+
+
+def make_episodes(path: Path) -> None:
+    from test_episode_files_mutated import own_file
+
+    path.write_bytes(gzip.compress(own_file(path), mtime=0) if path.suffix == ".gz" else own_file(path))
+
+
+def read_episodes(path: Path) -> Any:
+    from wiw.datasets import episodes
+
+    return episodes.load(path)
+
+
+def read_preset(path: Path) -> Any:
+    from wiw.tasks.presets import load_preset
+
+    return load_preset("imagenav", path)
+
+
+def read_study(path: Path) -> Any:
+    from wiw.studies.study_file import load_study
+
+    return load_study(path)
+
+
+def read_recipe(path: Path) -> Any:
+    from wiw.training.post_training.recipe import load_recipe
+
+    return load_recipe("pocket", path)
+
+
+def make_rollout(path: Path) -> None:
+    from wiw.loop.rollout_cache import RolloutCache
+
+    RolloutCache(path.parent / "cache").put("ab" + "0" * 30, 0, np.arange(96, dtype=np.uint8).reshape(2, 4, 4, 3))
+    (made,) = path.parent.rglob("*.frames")
+    shutil.copy(made, path)
+
+
+def read_rollout(data: bytes, folder: Path) -> Any:
+    from wiw.loop.rollout_cache import RolloutCache
+
+    path = folder / "ab" / ("0" * 30 + ".frames")
+    path.parent.mkdir(exist_ok=True)
+    path.write_bytes(data)
+    return RolloutCache(folder).get("ab" + "0" * 30, 0, np.empty((2, 4, 4, 3), np.uint8))
+
+
+def read_announcement(path: Path) -> Any:
+    from wiw.wire.address_book import read_addresses
+
+    return read_addresses(path)
+
+
+def read_job_list(path: Path) -> Any:
+    from wiw.runs.submission import read_jobs
+
+    return read_jobs(path.parent)
+
+
+def read_message(data: bytes, folder: Path) -> Any:
+    from wiw.wire.messages import decode
+
+    return decode(data)
+
+
+def make_message(folder: Path) -> bytes:
+    from test_wire import MESSAGES
+
+    from wiw.wire.messages import encode
+
+    return max(map(encode, MESSAGES), key=len)
+
+
+def make_row(folder: Path) -> bytes:
+    from test_wire import ROW
+
+    return bytes(ROW)
+
+
+def read_row(data: bytes, folder: Path) -> Any:
+    from wiw.wire.rows import unpack_row
+
+    return unpack_row(data)
+
+
+def read_reply(data: bytes, folder: Path) -> Any:
+    """Read what a model's process answers, as the run's side of the firewall does."""
+    from wiw.isolation.connection import send
+    from wiw.isolation.process import ChildProcess, _build_error
+
+    ours, theirs = socket.socketpair()
+    with ours, theirs:
+        process = object.__new__(ChildProcess)
+        process._connection, process._await_reply = ours, lambda until: None  # type: ignore[method-assign]
+        send(theirs, data)
+        reply = process._receive(None)
+    return _build_error(reply["error"]) if "error" in reply else reply.get("value")
+
+
+def make_reply(folder: Path) -> bytes:
+    error = {"type": "RolloutError", "kind": "raised", "text": "why"}
+    return bytes(msgpack.packb({"held": True, "value": {"shape": [2, 3], "dtype": "uint8"}, "error": error}))
+
+
+def make_glb(folder: Path) -> bytes:
+    from test_damaged_files import textured_glb
+
+    return textured_glb()
+
+
+def make_stl(folder: Path) -> bytes:
+    faces = np.zeros(4, [("normal", "<f4", 3), ("corners", "<f4", (3, 3)), ("attribute", "<u2")])
+    corners = np.array([[0, 0, 0], [1, 0, 0], [0, 1, 0], [0, 0, 1]], np.float32)
+    faces["corners"] = corners[[[0, 2, 1], [0, 1, 3], [1, 2, 3], [2, 0, 3]]]
+    return b"\0" * 80 + struct.pack("<I", 4) + faces.tobytes()
+
+
+def read_mesh(path: Path) -> Any:
+    from test_damaged_files import plain
+
+    return plain(path).describe()
+
+
+def read_link(path: Path) -> Any:
+    return wiw.physics.read_surface(path, link="hand")
+
+
+def take_config(name: str) -> Callable[[Path], bytes]:
+    return lambda folder: (CONFIGS / name).read_bytes()
+
+
+READERS: dict[str, Reader] = {
+    "glb": Reader(make_glb, from_file("m.glb", read_mesh), "glb"),
+    "link stl": Reader(make_stl, from_file("m.stl", read_link)),
+    "navmesh": Reader(write_and_take("m.navmesh", make_navmesh), from_file("m.navmesh", read_navmesh)),
+    "scene cache": Reader(write_and_take("m.wiwscene", make_scene_cache), from_file("m.wiwscene", read_scene_cache)),
+    "store": Reader(write_and_take("run.sqlite", make_store), from_file("run.sqlite", read_store)),
+    "episodes": Reader(write_and_take("e.json", make_episodes), from_file("e.json", read_episodes), "json"),
+    "questions": Reader(write_and_take("q.json", make_questions), from_file("q.json", read_questions), "json"),
+    "preset": Reader(take_config("default/imagenav.yaml"), from_file("p.yaml", read_preset), "yaml"),
+    "study": Reader(take_config("studies/vlm.yaml"), from_file("s.yaml", read_study), "yaml"),
+    "recipe": Reader(take_config("post-training/pocket.yaml"), from_file("r.yaml", read_recipe), "yaml"),
+    "rollout": Reader(write_and_take("r.frames", make_rollout), read_rollout),
+    "announcement": Reader(
+        lambda folder: b'{"address": "ws://a:1", "token": "t"}', from_file("1.json", read_announcement), "json"
+    ),
+    "jobs": Reader(
+        lambda folder: b'[{"cluster": "slurm", "id": "7_1", "arguments": ["run", "imagenav"]}]',
+        from_file("jobs.json", read_job_list),
+        "json",
+    ),
+    "message": Reader(make_message, read_message, "msgpack"),
+    "row": Reader(make_row, read_row, "msgpack"),
+    "reply": Reader(make_reply, read_reply, "msgpack", (OSError,)),  # a model's process that broke its protocol
+    "weights": Reader(write_and_take("w.safetensors", make_weights), from_file("w.safetensors", read_weights)),
+    "frames": Reader(write_and_take("f.parquet", make_frames), from_file("f.parquet", read_frames)),
+}

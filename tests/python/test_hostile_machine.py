@@ -1,0 +1,91 @@
+# SPDX-License-Identifier: Apache-2.0
+"""A machine that takes away processes, descriptors, time and caches changes no result."""
+
+from __future__ import annotations
+
+import os
+import signal
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import pytest
+from crash_victims import Victims, build_faults, evaluate
+from fakes import LineAgent, LineTask
+from test_crash import facts
+
+import wiw.errors
+from wiw import scenes
+from wiw.studies.evaluate import run_arms
+
+
+@dataclass
+class Mortal(LineAgent):
+    """Its process is killed at every tenth episode, once."""
+
+    markers: str = ""
+
+    def _decide(self, query: Any) -> Any:
+        marker = Path(self.markers, str(query.key.episode))
+        if query.key.episode % 10 == 9 and not marker.exists():
+            marker.touch()
+            os.kill(os.getpid(), signal.SIGKILL)
+        return super()._decide(query)
+
+
+@pytest.fixture(scope="module")
+def victims(tmp_path_factory: pytest.TempPathFactory) -> Any:
+    server = Victims(build_faults(tmp_path_factory.mktemp("library")))
+    yield server
+    server.close()
+
+
+@pytest.fixture(scope="module")
+def reference(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    out = tmp_path_factory.mktemp("reference") / "run"
+    evaluate(out, episodes=3)
+    return out
+
+
+def test_a_worker_killed_every_ten_episodes_costs_no_result(tmp_path: Path) -> None:
+    (tmp_path / "markers").mkdir()
+    found = []
+    for name, agent in (("quiet", LineAgent()), ("killed", Mortal(markers=str(tmp_path / "markers")))):
+        workers = 1 if name == "quiet" else 2
+        run_arms(LineTask(), {"a": agent}, 30, out=tmp_path / name, progress=False, workers=workers, salt="")
+        found.append(facts(tmp_path / name)[:3])
+    assert len(list((tmp_path / "markers").iterdir())) == 3
+    assert found[0] == found[1]
+
+
+def test_out_of_descriptors_a_run_ends_with_the_reason_and_goes_on_later(
+    victims: Victims, reference: Path, tmp_path: Path
+) -> None:
+    ends = []
+    for most in range(5, 16):
+        out = tmp_path / str(most)
+        code = victims.run("evaluate", out, episodes=3, limits={"RLIMIT_NOFILE": most})
+        kind, _, reason = victims.said.partition(": ")
+        typed = issubclass(getattr(wiw.errors, kind, int), wiw.errors.Error)
+        assert code == 0 or typed or "Too many open files" in reason, victims.said
+        ends.append(code)
+        assert victims.run("evaluate", out, episodes=3) == 0, victims.said
+        assert facts(out) == facts(reference)
+    assert ends[0] != 0 and ends[-1] == 0
+
+
+def test_a_clock_that_jumps_by_thirty_years_changes_no_result(
+    victims: Victims, reference: Path, tmp_path: Path
+) -> None:
+    out = tmp_path / "run"
+    assert victims.run("evaluate", out, episodes=3, jumps=True) == 0, victims.said
+    assert facts(out) == facts(reference)
+
+
+def test_a_scene_is_read_where_nothing_can_be_cached(
+    tmp_path: Path, two_rooms: str, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+) -> None:
+    expected = scenes.load(two_rooms).describe()
+    (tmp_path / "file").write_text("in the way of a folder")
+    monkeypatch.setenv("WIW_CACHE", str(tmp_path / "file"))
+    assert scenes.load(two_rooms).describe() == expected

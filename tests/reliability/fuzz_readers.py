@@ -1,0 +1,76 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Fuzz one reader, guided by coverage of its Python code: fuzz_readers.py READER [options of libFuzzer, such as
+-runs=1000000 or -max_total_time=300]. Needs `pip install atheris`; without arguments it lists the readers.
+
+libFuzzer prints coverage (`cov`), and writes what fails to crash-*; a failure belongs into a test. Damage within the
+structure of msgpack, JSON, YAML and GLB takes turns with libFuzzer's own.
+"""
+
+from __future__ import annotations
+
+import random
+import signal
+import sys
+from pathlib import Path
+from tempfile import TemporaryDirectory
+from types import FunctionType
+
+import atheris
+
+HERE = Path(__file__).parent
+sys.path[:0] = [str(HERE.parent), str(HERE.parent / "python")]
+
+from readers import READERS, STRUCTURES  # noqa: E402
+
+
+def instrument(*packages: str) -> None:
+    """Count coverage in all Python functions of packages that are imported, whoever has imported them.
+
+    The import hook of Atheris does not see a package that is installed in editable mode.
+    """
+    for name, module in list(sys.modules.items()):
+        if name.partition(".")[0] in packages:
+            owners = [module, *(each for each in vars(module).values() if isinstance(each, type))]
+            for function in (each for owner in owners for each in list(vars(owner).values())):
+                if isinstance(function, FunctionType) and function.__module__ == name:
+                    atheris.instrument_func(function)
+
+
+def fuzz(name: str, folder: Path, options: list[str]) -> None:
+    """Fuzz a reader in this process until libFuzzer ends it."""
+    reader = READERS[name]
+    sample = reader.make_sample(folder)
+    reader.read(sample, folder)  # imports what it needs
+    instrument("wiw", "json", "yaml", "gzip")
+    corpus = folder / "corpus"
+    corpus.mkdir()
+    (corpus / "sample").write_bytes(sample)
+
+    def read(data: bytes) -> None:
+        try:
+            reader.read(data, folder)
+        except MemoryError:
+            pass
+        except Exception as error:
+            if not reader.refuses(error):
+                raise
+
+    def mutate(data: bytes, most: int, seed: int) -> bytes:
+        if seed % 2:
+            try:
+                return STRUCTURES[reader.structure](bytes(data), random.Random(seed))[:most]
+            except Exception:  # not well-formed, as most of the corpus is not
+                pass
+        return bytes(atheris.Mutate(data, most))
+
+    mutator = {"custom_mutator": mutate} if reader.structure else {}
+    signal.signal(signal.SIGINT, signal.default_int_handler)
+    atheris.Setup([sys.argv[0], "-timeout=10", "-rss_limit_mb=3000", *options, str(corpus)], read, **mutator)
+    atheris.Fuzz()
+
+
+if __name__ == "__main__":
+    if len(sys.argv) < 2 or sys.argv[1] not in READERS:
+        sys.exit(f"usage: fuzz_readers.py READER [OPTION ...]; readers: {', '.join(READERS)}")
+    with TemporaryDirectory() as own:
+        fuzz(sys.argv[1], Path(own), sys.argv[2:])
