@@ -85,7 +85,7 @@ class ActorInThisProcess:
     def start(self, job):
         self.jobs.append(job)
         for index, episode in job.episodes:
-            yield OutcomeRow(job.arm, EpisodeResult(index, episode.episode_id, episode.scene, "done"))
+            yield [OutcomeRow(job.arm, EpisodeResult(index, episode.episode_id, episode.scene, "done"))]
             if len(job.episodes) == 3:
                 yield RuntimeError("lost")
 
