@@ -20,6 +20,7 @@ from wiw.cli import main
 from wiw.errors import ArgumentError, ContractError, DependencyError, InfrastructureError, StoreError
 from wiw.runs import ray_engine
 from wiw.runs.config import EngineConfig, RunConfig
+from wiw.runs.execute import _group_by_scene
 from wiw.runs.recipes import AgentRecipe, TaskRecipe
 from wiw.runs.rows import OutcomeRow
 from wiw.runs.workers import Job, WorkerSpec
@@ -85,7 +86,7 @@ class ActorInThisProcess:
     def start(self, job):
         self.jobs.append(job)
         for index, episode in job.episodes:
-            yield OutcomeRow(job.arm, EpisodeResult(index, episode.episode_id, episode.scene, "done"))
+            yield [OutcomeRow(job.arm, EpisodeResult(index, episode.episode_id, episode.scene, "done"))]
             if len(job.episodes) == 3:
                 yield RuntimeError("lost")
 
@@ -155,6 +156,15 @@ def test_a_broken_contract_stops_the_run_as_in_this_process(ray, tmp_path):
             progress=False,
             engine="ray",
         )
+
+
+def test_scenes_with_few_episodes_share_a_job():
+    """Else a model would be asked for two episodes at a time, however many are to be live."""
+    episodes = LineTask().episodes(10)  # two of a scene
+    assert _group_by_scene(range(10), episodes, 2) == [[0, 1], [2, 3], [4, 5], [6, 7], [8, 9]]
+    assert _group_by_scene(range(10), episodes, 3) == [[0, 1, 2, 3], [4, 5, 6, 7], [8, 9]]
+    assert _group_by_scene([9, 0, 8, 1], episodes, 2) == [[9, 8], [0, 1]]
+    assert _group_by_scene([], episodes, 2) == []
 
 
 def test_jobs_are_of_one_scene(ray, tmp_path, monkeypatch):

@@ -4,6 +4,7 @@
 from __future__ import annotations
 
 from pathlib import Path
+from typing import Any
 
 import pytest
 
@@ -73,3 +74,24 @@ def test_training_in_python_refuses_such_minutes_too(minutes: float) -> None:
     with pytest.raises(ArgumentError, match="minutes: expected a finite number above 0"):
         run_training(lambda: counter, None, 1, minutes, warmup_cosine_schedule(0.1), lambda *_: None)
     assert counter.steps == 0
+
+
+def test_clips_are_encoded_ahead_by_the_command(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    pytest.importorskip("diffusers", reason="no diffusers: pip install 'wiw[diffusers]'")
+    pytest.importorskip("pyarrow", reason="no pyarrow: pip install 'wiw[export]'")
+    from wiw.ray_cluster import Engine
+    from wiw.training.post_training import encode_clips as module
+
+    given: list[Any] = []
+    monkeypatch.setattr(module, "encode_clips", lambda *args, **named: (given.append((args, named)), 7)[1])
+    (tmp_path / "data").mkdir()
+    asked = ["train", "nwm-action", "--data", str(tmp_path / "data"), "--device", "cpu", "--option", "frames=6"]
+    cache = ["--cache", str(tmp_path / "cache"), "--encode-only"]
+    assert main([*asked, *cache, "--engine", "ray", "--workers", "3"]) == 0
+    ((args, named),) = given
+    assert args == ("nwm-action", tmp_path / "data", tmp_path / "cache")
+    assert (named["workers"], named["place"], named["recipe"].frames) == (3, Engine(engine="ray"), 6)
+    assert main([*asked, "--encode-only"]) == 2  # into which folder?
+    assert main([*asked, "--workers", "3"]) == 2  # for --encode-only
+    assert main(["train", "warpnet", "--encode-only"]) == 2
+    assert len(given) == 1

@@ -421,3 +421,38 @@ def test_the_command_names_scripts_by_their_content(tmp_path: Path) -> None:
     assert [client.ask([request])[0].text for client in (first, second)] == ["one", "two"]
     assert first.model.startswith("answer-") and first.model != second.model
     assert _client("mock", 0, "").model == "mock"
+
+
+def test_a_server_with_a_token_answers_nobody_without_it(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("OPENAI_API_KEY", "another")
+    with VlmServer(MockClient(), token="secret") as server:
+        told = connect(server.url, key="secret", attempts=1).ask(REQUESTS[2:3])
+        assert told[0].text and server.count == 1
+        for given in ({}, {"key": "secre"}, {"key": "secret2"}):
+            with pytest.raises(VlmError, match="401") as error:
+                connect(server.url, model="mock", attempts=1, **given).ask(REQUESTS[2:3])
+            assert error.value.kind == "refused"
+        with pytest.raises(VlmError, match="401"):
+            connect(server.url, attempts=1).model  # noqa: B018 - asks for the list of models
+        assert server.count == 1
+        monkeypatch.setenv("OPENAI_API_KEY", "secret")
+        assert pickle.loads(pickle.dumps(connect(server.url, key="secret"))).model == "mock"
+    with pytest.raises(ArgumentError, match="set WIW_TOKEN"):
+        VlmServer(MockClient(), host="0.0.0.0")
+
+
+def test_the_command_announces_where_it_serves(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    from wiw.cli import main
+    from wiw.wire.address_book import read_addresses
+
+    found: list[Any] = []
+    file = tmp_path / "server.json"
+
+    def look(server: VlmServer) -> None:
+        found.extend([*read_addresses(file), server.token, server.url])
+        server._http.server_close()
+
+    monkeypatch.setattr(VlmServer, "serve", look)
+    assert main(["serve-vlm", "--model", "mock", "--port", "0", "--token", "secret", "--announce", str(file)]) == 0
+    address, token, url = found
+    assert (address.address, address.token, token) == (url, "secret", "secret") and not file.exists()

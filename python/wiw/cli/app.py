@@ -12,6 +12,7 @@ import tyro
 
 import wiw
 from wiw import benchmark
+from wiw.cli.bench import bench_gpu
 from wiw.cli.blame import blame
 from wiw.cli.check_model import check_model
 from wiw.cli.collect_decisions import collect_decisions
@@ -161,6 +162,14 @@ GROUPS: Mapping[str, Group] = {
             (export_data, "export", "Write navigation or manipulation data as a LeRobot dataset, format v3.0."),
             (import_data, "import", "Write the collection that a LeRobot dataset was exported from."),
         ),
+    ),
+    "bench": Group(
+        "Measure this machine's GPU: rendering, small networks, memory.",
+        """Measure what this machine does for wiw.
+
+  $ wiw bench gpu --out gpu.json""",
+        ((bench_gpu, "gpu", "Rendering in batches, rollout and training step of each small network, memory."),),
+        default="gpu",
     ),
     "prompts": Group(
         "Import the prompts of your own copy of the paper.",

@@ -191,7 +191,7 @@ def _run_jobs(
     jobs = [
         Job(arm, tuple((index, episodes[index]) for index in group[first : first + sizes[arm]]))
         for arm, left in pending.items()
-        for group in (_group_by_scene(left, episodes) if by_scene else [left])
+        for group in (_group_by_scene(left, episodes, spec.live) if by_scene else [left])
         for first in range(0, len(group), max(1, sizes[arm]))
     ]
     if jobs and (place.engine == "ray" or workers > 1):
@@ -206,11 +206,18 @@ def _run_jobs(
         run_in_workers(spec, jobs, writer, workers)
 
 
-def _group_by_scene(indices: Iterable[int], episodes: Sequence[Episode]) -> list[list[int]]:
-    groups: dict[str, list[int]] = {}
+def _group_by_scene(indices: Iterable[int], episodes: Sequence[Episode], least: int) -> list[list[int]]:
+    """Return the episodes scene by scene; scenes with fewer than `least` share a group, so that calls stay batched."""
+    scenes: dict[str, list[int]] = {}
     for index in indices:
-        groups.setdefault(episodes[index].scene, []).append(index)
-    return list(groups.values())
+        scenes.setdefault(episodes[index].scene, []).append(index)
+    groups: list[list[int]] = []
+    for own in scenes.values():
+        if groups and len(groups[-1]) < least:
+            groups[-1].extend(own)
+        else:
+            groups.append(own)
+    return groups
 
 
 SAME_ERRORS = 5

@@ -12,9 +12,11 @@ from __future__ import annotations
 import os
 import queue
 import secrets
+import time
 from collections import deque
 from collections.abc import Iterable, Iterator, Mapping
 from concurrent.futures import ThreadPoolExecutor
+from contextlib import suppress
 from dataclasses import dataclass, field, replace
 from typing import Any
 
@@ -42,6 +44,8 @@ TRIES = 3
 """How often an episode is begun whose actor, or whose server, is lost."""
 UNREACHABLE = ("connection", "unreachable")
 """Kinds of errors that say that a server was lost, of world models and of language models."""
+TOGETHER = 0.02
+"""Seconds that an actor waits for more rows before it sends some."""
 START_SECONDS = 600.0
 """Time that the cluster has for giving an actor its resources."""
 
@@ -59,12 +63,21 @@ class EpisodeActor:
     def prepare(self) -> None:
         """Return once the actor is there."""
 
-    def run(self, job: Job) -> Iterator[Row | Exception]:
-        """Run a job's episodes and yield their rows; an exception that ends it is the last."""
+    def run(self, job: Job) -> Iterator[list[Row | Exception]]:
+        """Run a job's episodes and yield their rows, those together that come together, for each message of Ray's costs
+        some milliseconds; an exception that ends the job is the last.
+        """
         rows: queue.SimpleQueue[Row | Exception | None] = queue.SimpleQueue()
         self._thread.submit(self._run, job, rows)
-        while (row := rows.get()) is not None:
-            yield row
+        found: list[Row | Exception | None] = []
+        while None not in found:
+            found = [rows.get()]
+            time.sleep(TOGETHER)
+            with suppress(queue.Empty):
+                while True:
+                    found.append(rows.get_nowait())
+            if told := [row for row in found if row is not None]:
+                yield told
 
     def _run(self, job: Job, rows: queue.SimpleQueue[Row | Exception | None]) -> None:
         try:
@@ -200,7 +213,7 @@ class _ActorPool:
                 self._ray.get(lease.rows)
                 lease.rows = None
                 return
-            row = self._ray.get(next(lease.rows))
+            rows = self._ray.get(next(lease.rows))
         except StopIteration:
             lease.job, lease.rows = None, None
             return
@@ -209,8 +222,12 @@ class _ActorPool:
             return
         except self._ray.exceptions.RayTaskError as error:
             raise InfrastructureError(f"an actor of Ray failed: {error}") from error
+        for row in rows:
+            self._receive_row(lease, lease.job, row)
+
+    def _receive_row(self, lease: _Lease, job: Job, row: Row | Exception) -> None:
         if isinstance(row, Exception):
-            if not self._may_try_again(lease.job, row):
+            if not self._may_try_again(job, row):
                 raise row
             self._lease_again(lease, lease.unfinished)
         elif isinstance(row, OutcomeRow):
