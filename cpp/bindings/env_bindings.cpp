@@ -46,6 +46,20 @@ struct Images {
   }
 };
 
+/// What can be seen from where an environment stands now, and nothing else of it.
+struct Outlook {
+  NavigationEnv env;
+};
+
+py::dict draw(const NavigationEnv& env, const std::vector<std::string>& outputs) {
+  Images images(env.config(), outputs, 0);
+  {
+    const py::gil_scoped_release release;
+    env.observe(images.targets);
+  }
+  return images.arrays;
+}
+
 }  // namespace
 
 void bind_env(py::module_& module) {
@@ -66,6 +80,12 @@ void bind_env(py::module_& module) {
            py::arg("forward_m") = 0.2, py::arg("turn_deg") = 22.5, py::arg("motion") = Motion::kRefuse,
            py::arg("camera_height") = 1.0, py::arg("panorama") = std::pair(576, 1024),
            py::arg("front") = std::pair(480, 480), py::arg("front_hfov_deg") = 90.0);
+
+  py::class_<Outlook>(module, "Outlook", "The view from one place. It draws pictures, and tells and moves nothing.")
+      .def(
+          "draw",
+          [](const Outlook& outlook, const std::vector<std::string>& outputs) { return draw(outlook.env, outputs); },
+          py::arg("outputs"), "As NavigationEnv.observe.");
 
   py::class_<NavigationEnv>(module, "NavigationEnv")
       .def(py::init([](std::shared_ptr<render::Renderer> renderer, std::shared_ptr<nav::NavMesh> navmesh,
@@ -97,18 +117,11 @@ void bind_env(py::module_& module) {
           },
           py::arg("actions"), "float64 [K, 4, 4]: camera poses after each of [K] integer primitives; nothing moves.")
       .def(
-          "observe",
-          [](const NavigationEnv& env, const std::vector<std::string>& outputs) {
-            Images images(env.config(), outputs, 0);
-            {
-              const py::gil_scoped_release release;
-              env.observe(images.targets);
-            }
-            return images.arrays;
-          },
-          py::arg("outputs") = std::vector<std::string>{"panorama", "front"},
-          "{name: array}: panorama uint8 [H, W, 3], front uint8 [h, w, 3], depth float32 [H, W] (distance along the "
-          "ray), panorama_ids uint32 [H, W] and front_ids uint32 [h, w] (instances, 0 where nothing is hit).");
+          "outlook", [](const NavigationEnv& env) { return Outlook{env}; },
+          "What can be seen from here, to be drawn later; the environment may have moved on by then.")
+      .def("observe", &draw, py::arg("outputs") = std::vector<std::string>{"panorama", "front"},
+           "{name: array}: panorama uint8 [H, W, 3], front uint8 [h, w, 3], depth float32 [H, W] (distance along the "
+           "ray), panorama_ids uint32 [H, W] and front_ids uint32 [h, w] (instances, 0 where nothing is hit).");
 
   py::class_<VectorEnv>(module, "VectorEnv")
       .def(py::init<std::vector<NavigationEnv>>(), py::arg("envs"))

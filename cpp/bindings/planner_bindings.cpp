@@ -32,13 +32,6 @@ T choose(const std::string& value, const std::map<std::string, T>& choices, cons
   throw ArgumentError(std::string(name) + ": expected one of " + names + ", got '" + value + "'");
 }
 
-Bytes to_bytes(const py::array& array, const char* expected) {
-  if (!py::isinstance<py::array_t<std::uint8_t>>(array)) {
-    throw ArgumentError(std::string("expected ") + expected + ", got " + shape_text(array));
-  }
-  return Bytes(array);
-}
-
 Plans plans_of(const py::sequence& episodes) {
   Plans plans;
   for (const py::handle& episode : episodes) {
@@ -93,10 +86,40 @@ py::object part_object(const py::object& type, const Batch& batch, const ModelCa
               integers(part.shared), start_places(batch, part));
 }
 
-Panoramas to_panoramas(const Bytes& array) {
-  expect_shape(array, {-1, -1, -1, 3}, "panoramas uint8 [episodes, H, W, 3]");
-  return {array.data(), static_cast<std::size_t>(array.shape(0)),
-          Size{static_cast<int>(array.shape(1)), static_cast<int>(array.shape(2))}};
+/// Images of the episodes with the arrays that keep them alive.
+template <class T>
+struct EpisodeArrays {
+  std::vector<Array<T>> arrays;
+  EpisodeImages<T> images;
+};
+
+template <class T>
+Size image_size(const Array<T>& array, py::ssize_t channels, const std::string& expected) {
+  const bool fits = channels ? array.ndim() == 3 && array.shape(2) == channels : array.ndim() == 2;
+  if (!fits) throw ArgumentError("expected " + expected + ", got an episode's " + shape_text(array));
+  return {static_cast<int>(array.shape(0)), static_cast<int>(array.shape(1))};
+}
+
+/// One array of all episodes, or an iterable of one each, none of which is copied. `channels`: 0 for [H, W].
+template <class T>
+EpisodeArrays<T> to_episode_images(const py::iterable& items, py::ssize_t channels, const std::string& expected) {
+  EpisodeArrays<T> episodes;
+  for (const py::handle& item : items) {
+    if (!py::isinstance<py::array_t<T>>(item)) {
+      throw ArgumentError("expected " + expected + ", got " + std::string(py::str(py::type::of(item))));
+    }
+    const Array<T> array(py::reinterpret_borrow<py::object>(item));  // copied only where it is not dense
+    const Size size = image_size(array, channels, expected);
+    if (episodes.arrays.empty()) episodes.images.size = size;
+    if (!(size == episodes.images.size)) throw ArgumentError("expected " + expected + ", got images of several sizes");
+    episodes.images.images.push_back(array.data());
+    episodes.arrays.push_back(array);
+  }
+  return episodes;
+}
+
+EpisodeArrays<std::uint8_t> to_panoramas(const py::iterable& items) {
+  return to_episode_images<std::uint8_t>(items, 3, "panoramas uint8 [episodes, H, W, 3]");
 }
 
 /// The answers of a model with the arrays that keep them alive.
@@ -159,10 +182,10 @@ py::array_t<std::uint8_t> output(const std::optional<py::array>& out, const std:
 using MakeViews = void (*)(const Batch&, const ViewIndex&, const Panoramas&, const Imagination&, const ViewMaker&,
                            std::uint8_t*);
 
-py::array_t<std::uint8_t> views(const BoundBatch& self, const py::array& panoramas, const py::sequence& rollouts,
+py::array_t<std::uint8_t> views(const BoundBatch& self, const py::iterable& panoramas, const py::sequence& rollouts,
                                 const ViewMaker& maker, const std::string& frames, const std::optional<py::array>& out,
                                 bool dense) {
-  const Bytes real = to_bytes(panoramas, "panoramas uint8 [episodes, H, W, 3]");
+  const auto real = to_panoramas(panoramas);
   const Answers answers = to_answers(rollouts, frames);
   const auto steps = static_cast<py::ssize_t>(self.index.steps);
   const auto shape = dense ? with_view_shape({static_cast<py::ssize_t>(self.batch.candidates()), steps}, maker)
@@ -170,59 +193,54 @@ py::array_t<std::uint8_t> views(const BoundBatch& self, const py::array& panoram
   py::array_t<std::uint8_t> images = output(out, shape);
   const MakeViews make = dense ? &make_dense_views : &make_views;
   std::uint8_t* pixels = images.mutable_data();
-  const Panoramas source = to_panoramas(real);
   const py::gil_scoped_release release;
-  make(self.batch, self.index, source, answers.imagination, maker, pixels);
+  make(self.batch, self.index, real.images, answers.imagination, maker, pixels);
   return images;
 }
 
 py::array_t<std::uint8_t> ends(const BoundBatch& self, const Array<std::int64_t>& candidates,
-                               const py::array& panoramas, const py::sequence& rollouts, const ViewMaker& maker,
+                               const py::iterable& panoramas, const py::sequence& rollouts, const ViewMaker& maker,
                                const std::string& frames) {
   expect_shape(candidates, {-1}, "candidates int64 [n]");
-  const Bytes real = to_bytes(panoramas, "panoramas uint8 [episodes, H, W, 3]");
+  const auto real = to_panoramas(panoramas);
   const Answers answers = to_answers(rollouts, frames);
   const ViewIndex index =
       index_ends(self.batch, std::span(candidates.data(), static_cast<std::size_t>(candidates.size())));
   py::array_t<std::uint8_t> images(with_view_shape({candidates.size()}, maker));
   std::uint8_t* pixels = images.mutable_data();
-  const Panoramas source = to_panoramas(real);
   const py::gil_scoped_release release;
-  make_views(self.batch, index, source, answers.imagination, maker, pixels);
+  make_views(self.batch, index, real.images, answers.imagination, maker, pixels);
   return images;
 }
 
-void expect_episodes(const Batch& batch, py::ssize_t count) {
+void expect_episodes(const Batch& batch, std::size_t count) {
   for (const Row& row : batch.rows()) {
-    if (row.episode >= count) {
+    if (static_cast<std::size_t>(row.episode) >= count) {
       throw ArgumentError("expected one panorama an episode, got " + std::to_string(count) + " and plans for episode " +
                           std::to_string(row.episode));
     }
   }
 }
 
-py::array_t<std::uint8_t> observations(const BoundBatch& self, const py::array& panoramas, const ViewMaker& maker) {
-  const Bytes real = to_bytes(panoramas, "panoramas uint8 [episodes, H, W, 3]");
-  const Panoramas source = to_panoramas(real);
-  expect_episodes(self.batch, real.shape(0));
+py::array_t<std::uint8_t> observations(const BoundBatch& self, const py::iterable& panoramas, const ViewMaker& maker) {
+  const auto real = to_panoramas(panoramas);
+  expect_episodes(self.batch, real.arrays.size());
   py::array_t<std::uint8_t> images(with_view_shape({static_cast<py::ssize_t>(self.batch.rows().size())}, maker));
   std::uint8_t* pixels = images.mutable_data();
   const py::gil_scoped_release release;
-  make_observations(self.batch, source, maker, pixels);
+  make_observations(self.batch, real.images, maker, pixels);
   return images;
 }
 
-py::array_t<float> depths(const BoundBatch& self, const Array<float>& distances, const ViewMaker& maker) {
-  expect_shape(distances, {-1, -1, -1}, "distances float32 [episodes, H, W]");
-  expect_episodes(self.batch, distances.shape(0));
-  const Size size{static_cast<int>(distances.shape(1)), static_cast<int>(distances.shape(2))};
+py::array_t<float> depths(const BoundBatch& self, const py::iterable& distances, const ViewMaker& maker) {
+  const auto real = to_episode_images<float>(distances, 0, "distances float32 [episodes, H, W]");
+  expect_episodes(self.batch, real.arrays.size());
   py::array_t<float> images({static_cast<py::ssize_t>(self.batch.rows().size()),
                              static_cast<py::ssize_t>(maker.spec().size.height),
                              static_cast<py::ssize_t>(maker.spec().size.width)});
   float* pixels = images.mutable_data();
-  const float* source = distances.data();
   const py::gil_scoped_release release;
-  make_depths(self.batch, source, size, maker, pixels);
+  make_depths(self.batch, real.images, maker, pixels);
   return images;
 }
 
@@ -380,14 +398,16 @@ void bind_batch(py::module_& module) {
                              "int32 [candidates, steps]: which distinct observation a step shows, -1 behind the plan.")
       .def_property_readonly("real", &real_steps, "bool [candidates, steps]: shown by the real panorama.")
       .def("observations", &observations, py::arg("panoramas"), py::arg("maker"),
-           "uint8 [rows, (4,) h, w, 3]: what each row begins with, the real panorama after its leading turns.")
+           "uint8 [rows, (4,) h, w, 3]: what each row begins with, the real panorama after its leading turns. "
+           "panoramas: "
+           "one array [episodes, H, W, 3], or one [H, W, 3] an episode, which saves a copy; likewise below.")
       .def(
           "depths", &depths, py::arg("distances"), py::arg("maker"),
           "float32 [rows, h, w] of distances float32 [episodes, H, W]: planar z in perspective, distance in panoramas.")
       .def(
           "views",
-          [](const BoundBatch& self, const py::array& panoramas, const py::sequence& rollouts, const ViewMaker& maker,
-             const std::string& frames, const std::optional<py::array>& out) {
+          [](const BoundBatch& self, const py::iterable& panoramas, const py::sequence& rollouts,
+             const ViewMaker& maker, const std::string& frames, const std::optional<py::array>& out) {
             return views(self, panoramas, rollouts, maker, frames, out, true);
           },
           py::arg("panoramas"), py::arg("rollouts"), py::arg("maker"), py::arg("frames") = "panorama",
@@ -397,8 +417,8 @@ void bind_batch(py::module_& module) {
           "a part; frames: 'panorama' or 'perspective'.")
       .def(
           "distinct_views",
-          [](const BoundBatch& self, const py::array& panoramas, const py::sequence& rollouts, const ViewMaker& maker,
-             const std::string& frames, const std::optional<py::array>& out) {
+          [](const BoundBatch& self, const py::iterable& panoramas, const py::sequence& rollouts,
+             const ViewMaker& maker, const std::string& frames, const std::optional<py::array>& out) {
             return views(self, panoramas, rollouts, maker, frames, out, false);
           },
           py::arg("panoramas"), py::arg("rollouts"), py::arg("maker"), py::arg("frames") = "panorama",

@@ -4,8 +4,8 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
-from typing import Any, Final, Literal
+from dataclasses import dataclass, field, fields
+from typing import Any, Final, Literal, Protocol
 
 import numpy as np
 from numpy.typing import NDArray
@@ -95,6 +95,13 @@ class TextAnswer:
     """Whether the agent gives this as its answer; the task's rules say when that ends the episode."""
 
 
+class Outlook(Protocol):
+    """The view from one place, to be drawn when somebody looks."""
+
+    def draw(self, outputs: Sequence[str]) -> dict[str, NDArray[Any]]:
+        """Return images by name: "panorama", "front", "depth"; see `Observation`."""
+
+
 @dataclass(frozen=True)
 class Observation:
     """What the agent perceives: images, odometry since the episode's start, and depth where the run grants it.
@@ -108,10 +115,41 @@ class Observation:
     """uint8 [480, 480, 3], HFOV 90 degrees."""
     odometry: NDArray[np.float64]
     """float64 [3]: x forward and y left in metres, azimuth in radians (left positive), in the frame of the start."""
-    depth: NDArray[np.float32] | None = None
+    depth: NDArray[np.float32] | None = field(default_factory=lambda: None)
     """float32 [576, 1024] distance along the ray in metres, 0 where nothing is hit; None unless asked for."""
     target: Target | None = None
     """Where the task points something out."""
+
+    @classmethod
+    def from_outlook(
+        cls, outlook: Outlook, odometry: NDArray[np.float64], images: Mapping[str, NDArray[Any]], depth: bool
+    ) -> Observation:
+        """Return an observation whose images are drawn when they are first read, but for those that are given.
+
+        Args:
+            outlook: that draws them, of the place of the observation, wherever the agent goes.
+            odometry: float64 [3].
+            images: by the names of fields.
+            depth: whether the observation has depth.
+        """
+        observation = object.__new__(cls)
+        observation.__dict__.update(images, odometry=odometry, target=None, _outlook=outlook)
+        if not depth:
+            observation.__dict__["depth"] = None
+        return observation
+
+    def __getattr__(self, name: str) -> Any:
+        """Draw an image that has not been read before; the panorama and its depth are drawn at once."""
+        outlook = self.__dict__.get("_outlook")
+        if outlook is None or name not in ("panorama", "front", "depth"):
+            raise AttributeError(f"'{type(self).__name__}' object has no attribute '{name}'")
+        names = ["front"] if name == "front" else [one for one in ("panorama", "depth") if one not in self.__dict__]
+        self.__dict__.update(outlook.draw(names))
+        return self.__dict__[name]
+
+    def __getstate__(self) -> dict[str, Any]:
+        """Return all fields, drawn: what can be copied and sent elsewhere."""
+        return {one.name: getattr(self, one.name) for one in fields(self)}
 
     def as_dict(self) -> dict[str, Any]:
         """Return the observation as gymnasium spaces see it; `depth` only where present.

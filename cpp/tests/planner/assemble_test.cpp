@@ -38,7 +38,7 @@ TEST_CASE("each cell shows its own source, repeated where plans agree, empty beh
                                            .frame_stride = kBytes}}};
   const ViewMaker maker({.kind = ViewKind::kPanorama, .size = kSize});
   std::vector<std::uint8_t> views(6 * kBytes, 99);
-  make_dense_views(batch, index, {.data = real.data(), .count = 1, .size = kSize}, imagined, maker, views.data());
+  make_dense_views(batch, index, {.images = {real.data()}, .size = kSize}, imagined, maker, views.data());
   const int expected[] = {2, 3, 2, 6, 1, 0};
   for (std::size_t cell = 0; cell < 6; ++cell) {
     const auto begin = views.begin() + static_cast<std::ptrdiff_t>(cell * kBytes);
@@ -47,7 +47,7 @@ TEST_CASE("each cell shows its own source, repeated where plans agree, empty beh
 
   const std::int64_t candidates[] = {1, 2, 0, 1};
   const int ending[] = {6, 1, 3, 6};
-  make_views(batch, index_ends(batch, candidates), {.data = real.data(), .count = 1, .size = kSize}, imagined, maker,
+  make_views(batch, index_ends(batch, candidates), {.images = {real.data()}, .size = kSize}, imagined, maker,
              views.data());
   for (std::size_t i = 0; i < 4; ++i) {
     const auto begin = views.begin() + static_cast<std::ptrdiff_t>(i * kBytes);
@@ -59,7 +59,7 @@ TEST_CASE("each cell shows its own source, repeated where plans agree, empty beh
 
 TEST_CASE("a rollout of the wrong length is refused") {
   const Batch batch({{{kForward, kForward}}}, {});
-  const Panoramas real{.count = 1, .size = kSize};
+  const Panoramas real{.images = {nullptr}, .size = kSize};
   CHECK_THROWS_AS(check_inputs(batch, real, {.rollouts = {{.rows = 1, .frames = 2}}}), ArgumentError);
   CHECK_THROWS_AS(check_inputs(batch, real, {}), ArgumentError);
   CHECK_THROWS_AS(check_inputs(batch, {}, {.rollouts = {{.rows = 1, .frames = 3}}}), ArgumentError);

@@ -17,7 +17,7 @@ void convert(const Batch& batch, const ViewIndex::Distinct& distinct, const Pano
              const Imagination& imagined, const ViewMaker& maker, std::uint8_t* out) {
   const Source& source = distinct.source;
   if (source.row < 0) {
-    const std::uint8_t* panorama = real.data + 3 * real.size.pixels() * static_cast<std::size_t>(distinct.episode);
+    const std::uint8_t* panorama = real.images[static_cast<std::size_t>(distinct.episode)];
     maker.from_panorama(panorama, real.size, source.frame * batch.spec().space.turn_rad, out);
     return;
   }
@@ -66,8 +66,8 @@ ViewIndex index_ends(const Batch& batch, std::span<const std::int64_t> candidate
 
 void check_inputs(const Batch& batch, const Panoramas& real, const Imagination& imagined) {
   for (const int episode : batch.episodes()) {
-    if (static_cast<std::size_t>(episode) >= real.count) {
-      throw ArgumentError("expected one panorama an episode, got " + std::to_string(real.count) +
+    if (static_cast<std::size_t>(episode) >= real.images.size()) {
+      throw ArgumentError("expected one panorama an episode, got " + std::to_string(real.images.size()) +
                           " and plans for episode " + std::to_string(episode));
     }
   }
@@ -119,16 +119,17 @@ void make_dense_views(const Batch& batch, const ViewIndex& index, const Panorama
 void make_observations(const Batch& batch, const Panoramas& real, const ViewMaker& maker, std::uint8_t* out) {
   parallel_for(batch.rows().size(), [&](std::size_t r) {
     const Row& row = batch.rows()[r];
-    const std::uint8_t* panorama = real.data + 3 * real.size.pixels() * static_cast<std::size_t>(row.episode);
+    const std::uint8_t* panorama = real.images[static_cast<std::size_t>(row.episode)];
     maker.from_panorama(panorama, real.size, row.turns * batch.spec().space.turn_rad, out + r * maker.bytes());
   });
 }
 
-void make_depths(const Batch& batch, const float* distances, Size size, const ViewMaker& maker, float* out) {
+void make_depths(const Batch& batch, const Distances& distances, const ViewMaker& maker, float* out) {
   parallel_for(batch.rows().size(), [&](std::size_t r) {
     const Row& row = batch.rows()[r];
-    const float* panorama = distances + size.pixels() * static_cast<std::size_t>(row.episode);
-    maker.depth(panorama, size, row.turns * batch.spec().space.turn_rad, out + r * maker.spec().size.pixels());
+    const float* panorama = distances.images[static_cast<std::size_t>(row.episode)];
+    maker.depth(panorama, distances.size, row.turns * batch.spec().space.turn_rad,
+                out + r * maker.spec().size.pixels());
   });
 }
 

@@ -29,12 +29,17 @@ ViewIndex index_views(const Batch& batch);
 /// candidate that is not in the batch or has no steps.
 ViewIndex index_ends(const Batch& batch, std::span<const std::int64_t> candidates);
 
-/// Real panoramas of the episodes, uint8 [episodes, H, W, 3].
-struct Panoramas {
-  const std::uint8_t* data = nullptr;
-  std::size_t count = 0;
+/// One dense image an episode, wherever each lies.
+template <class T>
+struct EpisodeImages {
+  std::vector<const T*> images;
   Size size;
 };
+
+/// Real panoramas of the episodes, uint8 [H, W, 3] each.
+using Panoramas = EpisodeImages<std::uint8_t>;
+/// Their distances, float [H, W] each.
+using Distances = EpisodeImages<float>;
 
 /// Frames that the model answered one call with: uint8 [rows, frames, H, W, 3]. Images are dense; rows and frames may
 /// lie any number of bytes apart, also none (a model that repeats an image need not copy it).
@@ -68,7 +73,7 @@ void make_dense_views(const Batch& batch, const ViewIndex& index, const Panorama
 /// What each row of the batch begins with: the real panorama after its leading turns, [rows, bytes of the maker].
 void make_observations(const Batch& batch, const Panoramas& real, const ViewMaker& maker, std::uint8_t* out);
 
-/// The same for depth, distances float [episodes, H, W] -> [rows, height, width]; see ViewMaker::depth.
-void make_depths(const Batch& batch, const float* distances, Size size, const ViewMaker& maker, float* out);
+/// The same for depth, -> [rows, height, width]; see ViewMaker::depth.
+void make_depths(const Batch& batch, const Distances& distances, const ViewMaker& maker, float* out);
 
 }  // namespace wiw::planner

@@ -242,6 +242,19 @@ def image_names(task: NavigationSpec, depth: bool) -> list[str]:
     return ["panorama", "front", *(["depth"] if depth else []), *([] if task.pointing is None else IDS)]
 
 
+def observe_place(task: NavigationSpec, core: Any, state: EpisodeState, depth: bool) -> Observation:
+    """Return what the agent sees from where the simulator stands.
+
+    The panorama, and its depth, are drawn now for whoever decides next, and with the episode over only if somebody
+    looks; so is the front view always. Where the task points something out, everything is drawn for its sake.
+    """
+    if task.pointing is not None:
+        return make_observation(task, core.observe(image_names(task, depth)), core.odometry, state)
+    over = state.ended or state.is_out_of_budget(task)
+    images = {} if over else core.observe(["panorama", *(["depth"] if depth else [])])
+    return Observation.from_outlook(core.outlook(), round_odometry(core.odometry), images, depth)
+
+
 def make_observation(
     task: NavigationSpec, images: dict[str, Any], odometry: NDArray[np.float64], state: EpisodeState
 ) -> Observation:

@@ -15,8 +15,7 @@ from wiw.envs.episode_state import (
     EpisodeState,
     NavigationSpec,
     draw_episode,
-    image_names,
-    make_observation,
+    observe_place,
     start_episode,
     wrap_episode,
 )
@@ -45,7 +44,7 @@ class NavigationEnv(gymnasium.Env[dict[str, Any], int], Env):
     def __init__(self, task: NavigationSpec, depth: bool = False) -> None:
         self.task = task
         self.render_mode = "rgb_array"
-        self._images = image_names(task, depth)
+        self._depth = depth
         self.action_space = action_space(task.choices)  # type: ignore[assignment]
         self.observation_space = observation_space(depth, task.pointing is not None)
         self._core: Any = None
@@ -217,8 +216,7 @@ class NavigationEnv(gymnasium.Env[dict[str, Any], int], Env):
     # ------------------------------------------------------------------------------------------------------------------
 
     def _observe(self) -> Observation:
-        images = self._core.observe(self._images)
-        self._observation = make_observation(self.task, images, self._core.odometry, self.state)
+        self._observation = observe_place(self.task, self._core, self.state, self._depth)
         return self._observation
 
     def _require_episode(self) -> None:

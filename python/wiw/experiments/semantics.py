@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from wiw.errors import ArgumentError
 from wiw.loop.imagination import Imagination, ImaginerWrapper, ModelInput, Request
-from wiw.loop.imagine import stack_depths
+from wiw.loop.imagine import list_depths
 from wiw.loop.model_imaginer import as_imaginer
 from wiw.loop.privileged import LiveEnvironments
 from wiw.perception.semantics import Semantics
@@ -87,5 +87,5 @@ class Labelled(ImaginerWrapper):
 
 def _label(source: Semantics, inputs: Any) -> NDArray[np.uint32]:
     own: list[ModelInput] = list(inputs)
-    depth = stack_depths(own) if "depth" in source.needs else None
+    depth = np.stack(list_depths(own)) if "depth" in source.needs else None
     return source.label_panoramas(np.stack([shown.observation.panorama for shown in own]), depth)

@@ -44,15 +44,15 @@ class ImaginedPrimitives(Imagination):
 
     def show(self, frames: FrameSpec) -> list[list[Rollout]]:
         """Return the rollouts in other views than the reviser's."""
-        panoramas = np.stack([observation.panorama for observation in self.observations])
+        panoramas = [observation.panorama for observation in self.observations]
         return _show(self.batch, panoramas, self.answers, self.view, frames)
 
     def ends(self, chosen: Sequence[tuple[int, int]]) -> tuple[NDArray[np.uint8], NDArray[np.uint8]]:
         """Return the panoramas and front views that (episode, candidate) plans end with, as they would be observed."""
         first = np.cumsum([0, *map(len, self.rollouts)])
         candidates = [first[episode] + candidate for episode, candidate in chosen]
-        panoramas = np.stack([observation.panorama for observation in self.observations])
-        sizes = panoramas.shape[1:3], self.observations[0].front.shape[:2]
+        panoramas = [observation.panorama for observation in self.observations]
+        sizes = panoramas[0].shape[:2], self.observations[0].front.shape[:2]
         whole, front = (
             self.batch.ends(candidates, panoramas, self.answers, view_maker(view, size))
             for view, size in zip(("panorama", "front"), sizes, strict=True)
@@ -66,7 +66,7 @@ def imagine_primitives(model: WorldModel, request: Request) -> ImaginedPrimitive
     with clock("platform"):
         plans = [[plan.actions for plan in own] for own in request.plans]
         batch = planner.Batch.build(plans, make_model_spec(accepts, request.frames.ends))
-        panoramas = np.stack([observation.panorama for observation in request.observations])
+        panoramas = [observation.panorama for observation in request.observations]
         parts, conditioning = batch.parts, _conditioning(accepts, batch, request.inputs)
         histories = None
         if accepts.history:
@@ -91,7 +91,7 @@ def imagine_primitives(model: WorldModel, request: Request) -> ImaginedPrimitive
 
 
 def _show(
-    batch: Any, panoramas: NDArray[np.uint8], answers: list[NDArray[np.uint8]], kind: View, frames: FrameSpec
+    batch: Any, panoramas: Sequence[NDArray[np.uint8]], answers: list[NDArray[np.uint8]], kind: View, frames: FrameSpec
 ) -> list[list[Rollout]]:
     """Rollouts in the views that are asked for, or in the front view where the model gives no other."""
     view = "front" if kind == "perspective" else frames.view
@@ -114,13 +114,13 @@ def _conditioning(accepts: Accepts, batch: Any, inputs: Sequence[ModelInput]) ->
     maker = maker_of(accepts)
     depth = simulators = None
     if "depth" in accepts.needs:
-        depth = batch.depths(stack_depths(inputs), maker)
+        depth = batch.depths(list_depths(inputs), maker)
     semantic = _labels(accepts, batch, inputs) if "semantic" in accepts.needs else None
     if "simulator" in accepts.needs:
         simulators = [
             _turn(inputs[e].simulator, turns) for e, turns in zip(batch.row_episode, batch.row_turns, strict=True)
         ]
-    panoramas = np.stack([own.observation.panorama for own in inputs])
+    panoramas = [own.observation.panorama for own in inputs]
     return Conditioning(batch.observations(panoramas, maker), depth=depth, semantic=semantic, simulators=simulators)
 
 
@@ -211,8 +211,8 @@ def seed_of(key: Key, candidate: int) -> int:
     return int(core.fold_key([key.seed, key.episode, key.decision, candidate]))
 
 
-def stack_depths(inputs: Sequence[ModelInput]) -> NDArray[np.float32]:
-    """Return the depth of all observations.
+def list_depths(inputs: Sequence[ModelInput]) -> list[NDArray[np.float32]]:
+    """Return the depth of each observation.
 
     Raises:
         ArgumentError: one has none.
@@ -220,7 +220,7 @@ def stack_depths(inputs: Sequence[ModelInput]) -> NDArray[np.float32]:
     depths = [own.observation.depth for own in inputs]
     if any(value is None for value in depths):
         raise ArgumentError("the world model needs depth: make the environment with depth=True")
-    return np.stack(depths)
+    return depths
 
 
 def _seeds(accepts: Accepts, batch: Any, keys: Sequence[Key], origins: Sequence[Sequence[int]]) -> NDArray[np.uint64]:

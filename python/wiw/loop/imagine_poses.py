@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 from wiw import action
 from wiw.loop.history import frames_of, stack_histories
 from wiw.loop.imagination import Imagination, ModelInput, Request
-from wiw.loop.imagine import seed_of, stack_depths
+from wiw.loop.imagine import list_depths, seed_of
 from wiw.loop.views import resize
 from wiw.policies.base import FrameSpec
 from wiw.types import Conditioning, Control, Proposal, Rollout, View
@@ -119,7 +119,7 @@ def _parts(rows: Sequence[_Row], most: int) -> Iterator[list[int]]:
 def _conditioning(accepts: Accepts, inputs: Sequence[ModelInput]) -> Conditioning:
     depth = simulators = None
     if "depth" in accepts.needs:
-        depth = np.stack([resize(value, accepts.size, cv2.INTER_NEAREST) for value in stack_depths(inputs)])
+        depth = np.stack([resize(value, accepts.size, cv2.INTER_NEAREST) for value in list_depths(inputs)])
     if "simulator" in accepts.needs:
         simulators = [own.simulator for own in inputs]
     image = np.stack([resize(own.observation.front, accepts.size) for own in inputs])

@@ -6,7 +6,7 @@ from __future__ import annotations
 import time
 import traceback
 from collections import deque
-from collections.abc import Collection, Mapping, Sequence
+from collections.abc import Collection, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from typing import Any, Protocol
 
@@ -157,7 +157,7 @@ def _advance(agent: Agent, running: list[LiveEpisode], sink: Sink) -> list[tuple
             return [(each.index, each.episode) for each in running]
         sink.episode(_build_error_result(running[0].index, running[0].episode, running[0].begin, kind, error))
         return []
-    for each, decision in zip(running, decisions, strict=True):
+    for each, decision in zip(running, _hand_over(decisions), strict=True):
         try:
             record = each.carry_out(decision)
             result = _build_result(each) if each.done else None
@@ -173,6 +173,13 @@ def _advance(agent: Agent, running: list[LiveEpisode], sink: Sink) -> list[tuple
         if result is not None:
             sink.episode(result)
     return []
+
+
+def _hand_over(decisions: list[Decision]) -> Iterator[Decision]:
+    """Yield decisions and keep none: what one was made of goes before the next is carried out."""
+    decisions.reverse()
+    while decisions:
+        yield decisions.pop()
 
 
 def _kind(error: BaseException) -> str:

@@ -38,5 +38,5 @@ def take_views(accepts: Accepts, observations: Sequence[Observation | ArmObserva
     if isinstance(observations[0], ArmObservation):
         return np.stack([resize(observation.front, accepts.size) for observation in observations])
     ahead = [[np.array([FORWARD], np.int8)]] * len(observations)  # a row per observation, without leading turns
-    panoramas = np.stack([observation.panorama for observation in observations if isinstance(observation, Observation)])
+    panoramas = [observation.panorama for observation in observations if isinstance(observation, Observation)]
     return np.asarray(planner.Batch.build(ahead).observations(panoramas, maker_of(accepts)))
