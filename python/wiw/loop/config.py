@@ -51,7 +51,7 @@ class AgentConfig(PlanConfig):
     def __post_init__(self) -> None:
         for name in ("candidates", "horizon", "depth", "width", "pool"):
             value = getattr(self, name)
-            if value is not None and not (isinstance(value, Integral) and value >= 1):
+            if value is not None and not (isinstance(value, Integral) and int(value) >= 1):
                 raise ArgumentError(f"agent: expected {name} of at least 1, got {value}")
         if not isinstance(self.execute, Integral | None):
             raise ArgumentError(f"agent: expected execute as a whole number, got {self.execute!r}")

@@ -22,7 +22,8 @@ HEADINGS = 16
 TURN = 2 * np.pi / HEADINGS
 STEP = 0.2
 SOURCE = (144, 256)
-"""Height and width of imagined panoramas: from 576x1024 it takes the same plan in 94 % of decisions (docs/results.md)."""
+"""Height and width of imagined panoramas: in 94 % of decisions it takes the plan that it takes with 576x1024
+(docs/results.md)."""
 SAME_PLACE = 0.15
 """Metres within which a place imagined before informs about this one."""
 
