@@ -62,7 +62,7 @@ def test_out_of_descriptors_a_run_ends_with_the_reason_and_goes_on_later(
     victims: Victims, reference: Path, tmp_path: Path
 ) -> None:
     ends = []
-    for most in range(5, 16):
+    for most in (5, 7, 9, 11, 13, 15, 17, 20, 64):
         out = tmp_path / str(most)
         code = victims.run("evaluate", out, episodes=3, limits={"RLIMIT_NOFILE": most})
         kind, _, reason = victims.said.partition(": ")

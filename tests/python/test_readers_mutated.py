@@ -16,7 +16,7 @@ from readers import READERS, damage
 
 HERE = Path(__file__).parent
 MOST_BYTES, MOST_SECONDS = 3 << 30, 10
-FEW, MANY = 40, int(os.environ.get("WIW_FUZZ_ROUNDS", "20000"))
+FEW, MANY = 40, int(os.environ.get("WIW_FUZZ_ROUNDS", "5000"))
 
 
 def read_damaged(names: list[str], folder: Path, begin: int, count: int) -> None:

@@ -65,7 +65,7 @@ def fuzz(name: str, folder: Path, options: list[str]) -> None:
 
     mutator = {"custom_mutator": mutate} if reader.structure else {}
     signal.signal(signal.SIGINT, signal.default_int_handler)
-    atheris.Setup([sys.argv[0], "-timeout=10", "-rss_limit_mb=3000", *options, str(corpus)], read, **mutator)
+    atheris.Setup([sys.argv[0], "-timeout=60", "-rss_limit_mb=3000", *options, str(corpus)], read, **mutator)
     atheris.Fuzz()
 
 
