@@ -5,13 +5,17 @@ import signal
 import subprocess
 import sys
 import time
+from contextlib import suppress
 from pathlib import Path
 
 import pytest
+from tyro.constructors import StructTypeInfo
 
 from wiw.cli import main
 from wiw.cli.doctor import examine
+from wiw.cli.flag_help import read_flags
 from wiw.cli.options import parse_options
+from wiw.cli.parts import AgentFlags
 from wiw.errors import ArgumentError
 from wiw.scenes import scans
 from wiw.studies.run_log import load_run
@@ -424,6 +428,17 @@ def test_each_task_names_the_policy_that_runs_it():
     assert default_policy("ar", "foresight") == "recogniser"
     with pytest.raises(ArgumentError, match="names no default"):
         default_policy(f"{Path(__file__).parent / 'fakes.py'}:LineTask")
+
+
+def test_descriptions_of_flags_are_paragraphs(capsys):
+    with suppress(SystemExit):
+        main(["run", "--help"])
+    words = " ".join(" ".join(line.strip("│ ") for line in capsys.readouterr().out.splitlines()).split())
+    assert "given again. isolate=false runs a model of your own in the process of the run. (repeatable)" in words
+    assert "the policy's own choice if not given. --revision-option" in words  # and no "(default: None)"
+    flags = StructTypeInfo.make(AgentFlags, AgentFlags(), False)
+    texts = {field.name: field.helptext() for field in read_flags(flags).fields}
+    assert all(texts.values()) and not any("\n" in text for text in texts.values())
 
 
 LEAVING = """

@@ -24,6 +24,7 @@ from wiw.cli.demo import demo
 from wiw.cli.doctor import doctor
 from wiw.cli.episodes import episodes
 from wiw.cli.export import export
+from wiw.cli.flag_help import read_flags
 from wiw.cli.judge import judge
 from wiw.cli.merge import merge
 from wiw.cli.names import list_names
@@ -306,5 +307,7 @@ def _name_group() -> int:
 
 def _run_app(app: tyro.extras.SubcommandApp, prog: str, description: str, arguments: Sequence[str]) -> Any:
     config = (tyro.conf.OmitArgPrefixes, tyro.conf.HelptextFromCommentsOff)
-    with make_registry():
+    registry = make_registry()
+    registry.struct_rule(read_flags)
+    with registry:
         return app.cli(prog=prog, description=description, args=arguments, config=config)

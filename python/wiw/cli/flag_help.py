@@ -1,0 +1,53 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The help of flags that a dataclass declares, one paragraph each.
+
+tyro takes the description of a field from its docstring, and keeps every line break there. It also adds
+"(default: None)" to flags whose description says what holds where they are not given.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+from functools import lru_cache, partial
+from typing import Annotated, Any, get_type_hints
+
+from tyro.conf import arg
+from tyro.constructors import StructConstructorSpec, StructFieldSpec, StructTypeInfo
+
+
+def read_flags(info: StructTypeInfo) -> StructConstructorSpec | None:
+    """Return how a dataclass of wiw is read from flags, None for other types: a rule for a `ConstructorRegistry`."""
+    is_ours = dataclasses.is_dataclass(info.type) and info.type.__module__.split(".")[0] == "wiw"
+    if not is_ours or not isinstance(info.default, info.type):
+        return None
+    types = get_type_hints(info.type, include_extras=True)
+    return StructConstructorSpec(
+        instantiate=info.type,
+        fields=tuple(
+            StructFieldSpec(
+                field.name,
+                _hide_none(types[field.name], getattr(info.default, field.name)),
+                getattr(info.default, field.name),
+                partial(_describe, info.type, field.name),
+            )
+            for field in dataclasses.fields(info.type)
+        ),
+    )
+
+
+def _describe(kind: type, name: str) -> str | None:
+    """Return the description of a field on one line."""
+    found = (_read_descriptions(base).get(name) for base in kind.__mro__ if dataclasses.is_dataclass(base))
+    return next((" ".join(text.split()) for text in found if text), None)
+
+
+@lru_cache
+def _read_descriptions(kind: type) -> dict[str, str]:
+    import docstring_parser  # only --help needs it
+
+    return {each.arg_name: each.description or "" for each in docstring_parser.parse_from_object(kind).params}
+
+
+def _hide_none(annotation: Any, default: Any) -> Any:
+    """Return the type of a field, marked not to show a default of None."""
+    return Annotated[annotation, arg(help_behavior_hint="")] if default is None else annotation
