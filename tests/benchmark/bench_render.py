@@ -145,6 +145,8 @@ def bench_size(triangles: int, arguments: argparse.Namespace) -> dict[str, float
     with tempfile.TemporaryDirectory() as folder:
         scene = Path(folder) / "scene.npz"
         arrays = render_scene.make(triangles)
+        if arguments.unordered:
+            arrays = render_scene.unordered(arrays)
         render_scene.save(arrays, scene)
         rows = start_all(scene, triangles, arguments.peers, arguments.install)
         describe(rows)
@@ -167,6 +169,7 @@ def bench_size(triangles: int, arguments: argparse.Namespace) -> dict[str, float
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--sizes", type=int, nargs="+", default=SIZES, help="triangles")
+    parser.add_argument("--unordered", action="store_true", help="one mesh whose triangles come in random order")
     parser.add_argument("--repeats", type=int, default=7)
     parser.add_argument("--peers", nargs="*", default=[*PEERS, *LEAN])
     parser.add_argument("--no-install", dest="install", action="store_false", help="only peers installed already")

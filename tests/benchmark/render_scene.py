@@ -7,7 +7,7 @@ count. One atlas texture, one lightmap. Y up, metres, both faces of every triang
 
 from __future__ import annotations
 
-from dataclasses import dataclass, fields
+from dataclasses import dataclass, fields, replace
 from pathlib import Path
 
 import numpy as np
@@ -186,6 +186,13 @@ def make(triangles: int, seed: int = 7) -> Arrays:
         positions.astype(np.float32), normals.astype(np.float32), uv.astype(np.float32), light_uv.astype(np.float32),
         faces.astype(np.uint32), starts[:, 0], starts[:, 1], atlas, lightmap, _views(rng),
     )  # fmt: skip
+
+
+def unordered(arrays: Arrays) -> Arrays:
+    """One object whose triangles come in random order, as those of many scans do."""
+    order = np.random.default_rng(0).permutation(len(arrays.triangles))
+    ends = [np.array([0, count]) for count in (len(arrays.positions), len(arrays.triangles))]
+    return replace(arrays, triangles=arrays.triangles[order], vertex_start=ends[0], triangle_start=ends[1])
 
 
 def perspective_rays(size: tuple[int, int], hfov_deg: float) -> NDArray[np.float32]:
