@@ -19,7 +19,7 @@ import tempfile
 import time
 from pathlib import Path
 
-ROUNDS, EPISODES, SCENES = 3, 12, 3
+ROUNDS, EPISODES, SCENES = 2, 9, 3
 ARMS = {
     "this": "none,warp,oracle",
     "this, futures of 576x1024": "none,warp=warp?size=[576,1024],oracle=oracle?size=[576,1024]",
@@ -33,7 +33,7 @@ def children_seconds() -> float:
     return used.ru_utime + used.ru_stime
 
 
-def run_cpu_seconds(python: str, arms: str, episodes: int = EPISODES) -> float:
+def run_cpu_seconds(python: str, arms: str, episodes: int) -> float:
     """Return the CPU time of a run."""
     before = children_seconds()
     with tempfile.TemporaryDirectory() as folder:
@@ -48,12 +48,12 @@ def compare_runs(against: str | None) -> None:
     runs = {name: (sys.executable, arms) for name, arms in ARMS.items()}
     if against is not None:
         runs["the other checkout"] = against, ARMS["this"]
-    for python, _ in dict.fromkeys(runs.values()):
-        run_cpu_seconds(python, "none")  # its scenes
+    for python in dict.fromkeys(python for python, _ in runs.values()):
+        run_cpu_seconds(python, "none", EPISODES)  # its scenes
     least = dict.fromkeys(runs, float("inf"))
     for _ in range(ROUNDS):
         for name, (python, arms) in runs.items():
-            least[name] = min(least[name], run_cpu_seconds(python, arms))
+            least[name] = min(least[name], run_cpu_seconds(python, arms, EPISODES))
     print(
         f"imagenav, none, warp and oracle, {EPISODES} episodes in {SCENES} apartments, least CPU time of {ROUNDS} runs"
     )
