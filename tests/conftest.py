@@ -4,6 +4,7 @@ from __future__ import annotations
 import gc
 import inspect
 import os
+import sys
 from collections.abc import Callable, Generator, Iterator
 from contextlib import ExitStack
 from functools import cache
@@ -48,6 +49,19 @@ BOXES = {  # name: material, least corner, greatest corner; metres, Y up
     "chest": ("red", (1.4, 0, -1.9), (2.2, 0.6, -1.5)),
     "picture": ("blue", (-3.99, 1.0, 0.2), (-3.97, 1.6, 1.0)),
 }
+
+
+@pytest.fixture(scope="module")
+def ray() -> Iterator[Any]:
+    """A cluster of two cores, for all tests of a module: starting one takes seconds."""
+    found = pytest.importorskip("ray", reason="needs ray: pip install 'wiw[ray]'")
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setenv("PYTHONPATH", os.pathsep.join([str(Path(__file__).parent / "python"), *sys.path]))
+        patch.setenv("RAY_USAGE_STATS_ENABLED", "0")
+        patch.setenv("OMP_NUM_THREADS", "1")
+        found.init(num_cpus=2, object_store_memory=10**8, include_dashboard=False, log_to_driver=False)
+        yield found
+        found.shutdown()
 
 
 @pytest.fixture(autouse=True, scope="session")

@@ -38,19 +38,6 @@ def facts(run):
 
 
 @pytest.fixture(scope="module")
-def ray():
-    """A cluster of two cores, for all tests: starting one takes seconds."""
-    found = pytest.importorskip("ray", reason="needs ray: pip install 'wiw[ray]'")
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setenv("PYTHONPATH", os.pathsep.join([str(Path(__file__).parent), *sys.path]))
-        patch.setenv("RAY_USAGE_STATS_ENABLED", "0")
-        patch.setenv("OMP_NUM_THREADS", "1")
-        found.init(num_cpus=2, object_store_memory=10**8, include_dashboard=False, log_to_driver=False)
-        yield found
-        found.shutdown()
-
-
-@pytest.fixture(scope="module")
 def reference(tmp_path_factory):
     out = tmp_path_factory.mktemp("reference") / "run"
     run_arms(LineTask(), {"none": LineAgent(0.5), "warp": LineAgent(0.8)}, 10, out=out, progress=False).close()

@@ -27,19 +27,6 @@ RULES = {"min_samples": 60, "spacing": 1.5, "leaf_ratio": 0.5}
 SMALL: dict[str, Any] = {"rules": RULES, "size": (36, 64), "seed": 3, "backend": "cpu", "passes": 2, "lossless": True}
 
 
-@pytest.fixture(scope="module")
-def ray():
-    """A cluster of two cores, for all tests: starting one takes seconds."""
-    found = pytest.importorskip("ray", reason="needs ray: pip install 'wiw[ray]'")
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setenv("PYTHONPATH", os.pathsep.join([str(Path(__file__).parent), *sys.path]))
-        patch.setenv("RAY_USAGE_STATS_ENABLED", "0")
-        patch.setenv("OMP_NUM_THREADS", "1")
-        found.init(num_cpus=2, object_store_memory=10**8, include_dashboard=False, log_to_driver=False)
-        yield found
-        found.shutdown()
-
-
 def contents(folder: Path) -> dict[str, bytes]:
     return {str(path.relative_to(folder)): path.read_bytes() for path in folder.rglob("*") if path.is_file()}
 

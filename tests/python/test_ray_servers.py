@@ -58,17 +58,16 @@ def facts(run):
 
 
 @pytest.fixture(scope="module")
-def ray(tmp_path_factory):
-    """A cluster of two cores, for all tests: starting one takes seconds."""
-    found = pytest.importorskip("ray", reason="needs ray: pip install 'wiw[ray]'")
+def calls(tmp_path_factory):
+    """The file in which served models note their calls, known to all processes of the cluster."""
     with pytest.MonkeyPatch.context() as patch:
-        patch.setenv("PYTHONPATH", os.pathsep.join([str(HERE.parent), *sys.path]))
-        patch.setenv("RAY_USAGE_STATS_ENABLED", "0")
-        patch.setenv("OMP_NUM_THREADS", "1")
         patch.setenv("CALLS", str(tmp_path_factory.mktemp("calls") / "calls"))
-        found.init(num_cpus=2, object_store_memory=10**8, include_dashboard=False, log_to_driver=False)
-        yield found
-        found.shutdown()
+        yield
+
+
+@pytest.fixture(scope="module")
+def ray(calls, ray):
+    return ray
 
 
 def run_walk(out, **settings):
