@@ -97,6 +97,53 @@ def test_habitat_episodes_run(two_rooms: str, tmp_path: Path) -> None:
     assert env.goal.image.std() > 1 and env.result()["shortest"] > 5
 
 
+def object_goal_file(path: Path, scene: str) -> Path:
+    """An ObjectNav file: two chests, of which the second has the nearer view points."""
+
+    def chest(name: str, *views: tuple[float, float]) -> dict:
+        states = [{"position": [x, 0.05, 1.0], "rotation": [0, 0.7071068, 0, 0.7071068]} for x, _ in views]
+        views_of = [{"agent_state": state, "iou": iou} for state, (_, iou) in zip(states, views, strict=True)]
+        return {"object_id": name, "object_category": "chest", "position": [0, 0, 0], "view_points": views_of}
+
+    episode = {
+        "episode_id": "0",
+        "scene_id": scene,
+        "start_position": [-2.0, 0.05, 0.5],
+        "start_rotation": [0, 0.0, 0, 1.0],
+        "info": {"geodesic_distance": 1.0, "closest_goal_object_id": 4},
+        "goals": [],
+        "object_category": "chest",
+        "shortest_paths": None,
+    }
+    goals = {f"{scene}_chest": [chest("3"), chest("4", (3.5, 0.9)), chest("5", (2.0, 0.2), (3.0, 0.4))]}
+    path.write_text(json.dumps({"episodes": [episode], "goals_by_category": goals}))
+    return path
+
+
+def test_an_object_goal_becomes_the_view_that_shows_most_of_the_nearest_object(tmp_path: Path) -> None:
+    (episode,) = files.load(object_goal_file(tmp_path / "e.json", "a.glb"), "/scenes")
+    assert episode.scene == "/scenes/a.glb" and np.isnan(episode.geodesic)
+    assert episode.goal_position == (3.0, 0.05, 1.0) and episode.goal_yaw == pytest.approx(np.pi / 2)
+    assert (episode.info["category"], episode.info["object"]) == ("chest", "5")
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        (lambda body: body.pop("goals_by_category"), "not a navigation episode"),
+        (lambda body: body["goals_by_category"].update({"a.glb_chest": []}), "not a navigation episode"),
+        (lambda body: body["episodes"][0].pop("object_category"), "not a navigation episode"),
+    ],
+)
+def test_object_goals_that_are_not_there_are_refused(tmp_path: Path, change: Any, message: str) -> None:
+    path = object_goal_file(tmp_path / "e.json", "a.glb")
+    body = json.loads(path.read_text())
+    change(body)
+    path.write_text(json.dumps(body))
+    with pytest.raises(FileError, match=f"episode 0: {message}"):
+        files.load(path, "/scenes")
+
+
 def world_in_world_file(path: Path, scene: str = "a/b.glb", **more: Any) -> Path:
     item = {
         "datum_id": 1,
@@ -158,6 +205,7 @@ def test_a_picture_outside_the_files_folder_is_not_read(tmp_path: Path) -> None:
 
 FORMATS = {
     "habitat": lambda path, scene: habitat_file(path.with_suffix(".json.gz"), scene),
+    "objects of habitat": object_goal_file,
     "world-in-world": world_in_world_file,
     "world-in-world with steps": lambda path, scene: world_in_world_file(path, scene, step_to_goal=33, goal_radius=9),
 }
@@ -168,6 +216,7 @@ FORMATS = {
     [
         ("habitat", "paper", 5.5, None),
         ("habitat", "official", 5.5, None),
+        ("objects of habitat", "official", 5.1, None),
         ("world-in-world", "official", 5.1, None),
         ("world-in-world with steps", "official", 5.1, 33),
     ],

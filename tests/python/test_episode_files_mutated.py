@@ -40,6 +40,16 @@ def habitat_file(path: Path) -> bytes:
     return json.dumps({"episodes": [item] * 3}).encode()
 
 
+def object_goal_file(path: Path) -> bytes:
+    item = {
+        "episode_id": "7", "scene_id": "a.glb", "start_position": [-2.0, 0.0, 0.5], "start_rotation": [0, 0.0, 0, 1.0],
+        "goals": [], "object_category": "bed",
+    }  # fmt: skip
+    view = {"agent_state": {"position": [3.0, 0.0, 1.0], "rotation": [0, 0, 0, 1]}, "iou": 0.4}
+    goals = {"a.glb_bed": [{"object_id": 3, "view_points": [view] * 2}]}
+    return json.dumps({"episodes": [item] * 3, "goals_by_category": goals}).encode()
+
+
 def world_in_world_file(path: Path) -> bytes:
     item = {
         "episode_id": 3, "scene_relpath": "a/b.glb", "goal_image_relpath": "i.png", "start_position": [-2.0, 0, 0.5],
@@ -60,6 +70,7 @@ def recognition_file(path: Path) -> bytes:
 FORMATS: dict[str, Callable[[Path], bytes]] = {
     "own": own_file,
     "habitat": habitat_file,
+    "objects of habitat": object_goal_file,
     "world-in-world": world_in_world_file,
     "active recognition": recognition_file,
 }

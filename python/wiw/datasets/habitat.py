@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Episode files of other systems: Habitat's PointNav-v1 (also its ImageNav) and World-in-World's ImageNav.
+"""Episode files of other systems: Habitat's PointNav-v1 (also its ImageNav), its ObjectNav-v1, World-in-World's ImageNav.
 
 Positions are metres, Y up, in all of them; the order of a quaternion is part of each format and never guessed.
 """
@@ -57,13 +57,18 @@ def read_habitat(body: Mapping[str, Any], path: str) -> list[Episode]:
 
     Habitat derives an ImageNav goal's heading from a hash that differs between processes. Here it is the heading of
     `goals[0].rotation` where the file has one, else a function of the episode's id.
+
+    An ObjectNav episode becomes an image goal: the view point that shows most of an object, which is that of its
+    category with the view point nearest to the start. Other objects of the category do not count, and the shortest path
+    is measured anew.
     """
-    return [_habitat(item, f"{path}: episode {i}") for i, item in enumerate(body["episodes"])]
+    objects = body.get("goals_by_category")
+    return [_habitat(item, objects, f"{path}: episode {i}") for i, item in enumerate(body["episodes"])]
 
 
-def _habitat(item: Mapping[str, Any], where: str) -> Episode:
+def _habitat(item: Mapping[str, Any], objects: Any, where: str) -> Episode:
     try:
-        goal = item["goals"][0]
+        goal, found = (item["goals"][0], {}) if item["goals"] else _find_view_point(item, objects)
         name = name_of(item["episode_id"], "episode_id")
         rotation = goal.get("rotation")
         yaw = yaw_of(rotation, "xyzw", where) if rotation is not None else heading_of(name)
@@ -74,13 +79,25 @@ def _habitat(item: Mapping[str, Any], where: str) -> Episode:
             start_yaw=yaw_of(item["start_rotation"], "xyzw", where),
             goal_position=point(goal["position"], "goals[0].position"),
             goal_yaw=yaw,
-            geodesic=float(item.get("info", {}).get("geodesic_distance", float("nan"))),
-            info={"source": "habitat", "goal_heading": "file" if rotation is not None else "episode id"},
+            geodesic=float("nan" if found else item.get("info", {}).get("geodesic_distance", "nan")),
+            info={"source": "habitat", "goal_heading": "file" if rotation is not None else "episode id", **found},
         )
     except _UNREADABLE as error:
         raise FileError(
             f"{where}: not a navigation episode of habitat-lab ({type(error).__name__}: {error})"
         ) from error
+
+
+def _find_view_point(item: Mapping[str, Any], objects: Any) -> tuple[Mapping[str, Any], dict[str, str]]:
+    """Return the position and rotation from which an ObjectNav episode's object is seen best, and what object it is."""
+    category = text(item["object_category"], "object_category")
+    start = np.array(point(item["start_position"], "start_position"))
+    goals = [goal for goal in objects[f"{Path(item['scene_id']).name}_{category}"] if goal["view_points"]]
+    places = [[point(view["agent_state"]["position"], "position") for view in goal["view_points"]] for goal in goals]
+    nearest = int(np.argmin([np.linalg.norm(np.array(own) - start, axis=1).min() for own in places]))
+    best = max(goals[nearest]["view_points"], key=lambda view: number(view["iou"], "iou"))
+    state = {"position": best["agent_state"]["position"], "rotation": best["agent_state"]["rotation"]}
+    return state, {"category": category, "object": name_of(goals[nearest]["object_id"], "object_id")}
 
 
 def is_world_in_world(body: Any) -> bool:
