@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Episode files of other systems: Habitat's PointNav-v1 (also its ImageNav), its ObjectNav-v1, World-in-World's ImageNav.
+"""Episode files of others: Habitat's PointNav-v1 (also its ImageNav) and ObjectNav-v1, World-in-World's ImageNav.
 
 Positions are metres, Y up, in all of them; the order of a quaternion is part of each format and never guessed.
 """
