@@ -18,6 +18,7 @@ from wiw.action import FORWARD, TURN_LEFT
 from wiw.errors import ArgumentError, WeightsError
 from wiw.mapping.occupancy import OccupancyGrid
 from wiw.policies.base import Situation
+from wiw.runs.recipes import AgentRecipe
 from wiw.types import Goal, Key, Observation, Rollout
 
 torch = pytest.importorskip("torch", reason="needs wiw[torch]")
@@ -405,7 +406,7 @@ def test_what_the_policy_needs_is_asked_for_in_words(situate: Any) -> None:
 def test_runs_of_one_and_of_two_workers_are_equal(tmp_path: Path) -> None:
     save(tmp_path / "weights.safetensors", tiny_network(), CARD)
     options = {"navigator": {"weights": str(tmp_path / "weights.safetensors")}}
-    agent = wiw.AgentRecipe("navigator", "warp", policy_options=options, depth=2, candidates=2, horizon=4)
+    agent = AgentRecipe("navigator", "warp", policy_options=options, depth=2, candidates=2, horizon=4)
     one, two = (
         wiw.evaluate("imagenav", agent, 2, scenes="apartments:val:2", workers=n, progress=False, out=tmp_path / str(n))
         for n in (1, 2)

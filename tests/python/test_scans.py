@@ -25,9 +25,11 @@ from wiw.datasets.worlds import navmesh_file, world
 from wiw.errors import ArgumentError, DependencyError, FileError
 from wiw.nav import NavMesh
 from wiw.render import Renderer
+from wiw.runs.recipes import AgentRecipe, TaskRecipe
 from wiw.scenes import basis
 from wiw.scenes.scans import hm3d, labels
 from wiw.scenes.scans.scene_dataset import words_of
+from wiw.studies.evaluate import evaluate
 from wiw.tasks.ar import AR
 
 EYES = ((2.6, 2.6, 1.2), (4.6, 3.2, 1.5), (6.5, 0.6, 1.0))
@@ -541,6 +543,37 @@ def test_targets_of_published_episodes_are_objects_of_the_scan(tmp_path: Path, i
     mask = task.environment().begin(episode).target.mask
     columns = (np.flatnonzero(mask.any(axis=0)) + 0.5) / mask.shape[1]  # of a panorama; its middle is ahead, -Z
     assert np.allclose(columns.mean(), 0.5 + np.arctan2(1.0, -1.3) / (2 * np.pi), atol=0.02)
+
+
+def test_published_questions_and_object_goals_run_on_a_scan(tmp_path: Path, in_process: None) -> None:
+    pytest.importorskip("opengl_basisu", reason="needs opengl_basisu: pip install 'wiw[hm3d]'")
+    path = files.write_hm3d(tmp_path)
+    start = [4.6, 0.0, -3.2]
+    question = {
+        "question": "What is beside the bed?",
+        "answer": "A table",
+        "category": "spatial understanding",
+        "question_id": "q1",
+        "episode_history": "hm3d-v0/000-hm3d-TEEsavR23oF",
+    }
+    (tmp_path / "open-eqa.json").write_text(json.dumps([question]))
+    view = {"agent_state": {"position": [5.6, 0.0, -3.0], "rotation": [0.0, 0.0, 0.0, 1.0]}, "iou": 0.5}
+    goal = {
+        "episode_id": "0",
+        "scene_id": str(path.relative_to(tmp_path)),
+        "start_position": start,
+        "start_rotation": [0.0, 0.0, 0.0, 1.0],
+        "goals": [],
+        "object_category": "table",
+    }
+    objects = {f"{path.name}_table": [{"object_id": files.TABLE, "view_points": [view]}]}
+    (tmp_path / "objectnav.json").write_text(json.dumps({"episodes": [goal], "goals_by_category": objects}))
+    for task, name, policy in (("aeqa", "open-eqa.json", "explorer"), ("imagenav", "objectnav.json", "heuristic")):
+        options = {"episode_file": str(tmp_path / name), "scene_folder": str(tmp_path)}
+        log = evaluate(TaskRecipe(task, options), AgentRecipe(policy), 1, out=tmp_path / task, progress=False)
+        (row,) = log.episodes
+        assert row["status"] == "done", row["error"]
+        assert Path(row["scene"]) == path
 
 
 def test_active_recognition_refuses_a_scan_without_labels(tmp_path: Path, in_process: None) -> None:

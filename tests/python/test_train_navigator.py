@@ -145,7 +145,7 @@ def test_the_command_trains_on_apartments(
     options: list[Any] = ["--epochs", "1", "--workers", "1", "--out", str(out), "--cache", str(tmp_path / "looks")]
     assert main([*command, *options]) == 0
     said = " ".join(capsys.readouterr().out.split())
-    assert "AUC within 2 m network" in said and "matcher's similarity" in said and "median error" in said
+    assert "AUC within 2 m: network" in said and "matcher's similarity" in said and "median error" in said
     card = Navigator(out).card
     assert card["scenes"] == "apartments:train:2" and card["held_out"]["pairs"] == 400
     assert not list(tmp_path.glob("*.checkpoint"))

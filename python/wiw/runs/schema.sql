@@ -12,7 +12,8 @@ CREATE TABLE episode (              -- the episodes that every arm runs
     episode_id TEXT NOT NULL,
     scene TEXT NOT NULL,
     start_x REAL NOT NULL, start_y REAL NOT NULL, start_z REAL NOT NULL, start_yaw REAL NOT NULL,  -- metres, radians
-    goal_x REAL NOT NULL, goal_y REAL NOT NULL, goal_z REAL NOT NULL, goal_yaw REAL NOT NULL,
+    goal_x REAL, goal_y REAL, goal_z REAL,  -- metres; NULL: not known
+    goal_yaw REAL NOT NULL,
     geodesic REAL,                  -- metres; NULL: not given, and not measured yet
     info TEXT NOT NULL              -- JSON
 );

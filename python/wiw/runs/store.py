@@ -949,8 +949,13 @@ def _episode(row: dict[str, Any], info: dict[str, Any]) -> Episode:
         row["scene"],
         (row["start_x"], row["start_y"], row["start_z"]),
         row["start_yaw"],
-        (row["goal_x"], row["goal_y"], row["goal_z"]),
+        (_read_length(row["goal_x"]), _read_length(row["goal_y"]), _read_length(row["goal_z"])),
         row["goal_yaw"],
-        math.nan if row["geodesic"] is None else row["geodesic"],
+        _read_length(row["geodesic"]),
         info,
     )
+
+
+def _read_length(value: float | None) -> float:
+    """Return metres; NaN where they are not known."""
+    return math.nan if value is None else value

@@ -172,6 +172,18 @@ class AEQA(NavigationTask):
         found = openeqa.load(self.episode_file, self.scene_folder) if published else super().load_episodes()
         return [_describe(episode) for episode in found]
 
+    def episodes(self, count: int) -> list[Episode]:
+        """Return the first `count` episodes; the scene of one without a start is opened, so that it has one.
+
+        Raises:
+            ArgumentError: the episode file or the scenes hold fewer.
+        """
+        found = super().episodes(count)
+        self._episodes[:count] = [
+            self.locate(self.open_world(each), each) if np.isnan(each.start_position).any() else each for each in found
+        ]
+        return self._episodes[:count]
+
     def locate(self, place: World, episode: Episode) -> Episode:
         """Return the episode with a start on the floor: OpenEQA's lists may give none."""
         return openeqa.locate_start(place, episode) if episode.info.get("source") == openeqa.SOURCE else episode
