@@ -600,12 +600,13 @@ def mutate(data: bytes, rng: random.Random) -> bytes:
     return bytes(changed)
 
 
+@pytest.mark.parametrize("rounds", [16, pytest.param(5000, marks=pytest.mark.nightly)])
 @pytest.mark.parametrize("kind", ["matterport", "hm3d", "replica", "scene_dataset"])
-def test_mutated_files_end_in_an_error_of_ours_or_a_scene(tmp_path: Path, kind: str) -> None:
+def test_mutated_files_end_in_an_error_of_ours_or_a_scene(tmp_path: Path, kind: str, rounds: int) -> None:
     path = getattr(files, f"write_{kind}")(tmp_path)
     rng, refused = random.Random(7), 0
     parts = sorted(file for file in tmp_path.rglob("*") if file.is_file())
-    for _ in range(16):
+    for _ in range(rounds):
         part = rng.choice(parts)
         whole = part.read_bytes()
         part.write_bytes(mutate(whole, rng))
