@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What a run costs: CPU time of `wiw run imagenav --arms none,warp,oracle`, and memory and time by live episodes.
+"""Costs of a run: CPU time of `wiw run imagenav --arms none,warp,oracle`, and memory and time by live episodes.
 
 The run goes beside one whose futures are drawn with 576x1024 pixels, as in version 1 of the benchmark, and beside that
 of another checkout where its Python is named. Runs alternate, each in processes of its own with scenes that are

@@ -46,7 +46,7 @@ WORKERS = (1, 2, 4, 8)
 DECISION = 0.25
 """Seconds of a decision outside the world model: two panoramas, an observation, the policy."""
 EPISODES = 8
-"""Of each worker; up to eight decisions each, one episode after the other."""
+"""Episodes of each worker; up to eight decisions each, one episode after the other."""
 LIVE = 32
 """Episodes that share the served model, over all workers."""
 SLEEPS = "BENCH_SLEEPS"

@@ -34,7 +34,7 @@ class Table:
     arms: int
     episodes: int
     decisions: float
-    """Of an episode, on average."""
+    """Decisions of an episode, on average."""
 
     @property
     def candidates(self) -> int:
@@ -42,7 +42,7 @@ class Table:
 
     @property
     def rollouts(self) -> float:
-        """Of all arms."""
+        """Sum over all arms."""
         return self.arms * self.episodes * self.decisions * self.candidates
 
     def hours(self, seconds: float, gpus: int, efficiency: float, loading: float) -> float:

@@ -87,7 +87,7 @@ def test_a_policy_that_reads_panoramas_costs_no_front_views(env):
 
 
 def test_what_was_observed_goes_before_the_next_is(two_rooms):
-    """Of all live episodes one decision at most is held while others are carried out."""
+    """At most one decision of all live episodes is held while others are carried out."""
     task, held, most = ImageNav(scenes=two_rooms, decisions=2), [], []
 
     class Sink:

@@ -34,7 +34,7 @@ BATCH = 50
 
 @dataclass(frozen=True)
 class Held:
-    """What the process holds."""
+    """Resources that the process holds."""
 
     seconds: float
     episodes: int

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What a machine's GPU does for wiw: rendering in batches, and rollout and training step of each small network.
+"""Figures of a machine's GPU: rendering in batches, and rollout and training step of each small network.
 
 One call measures all of it, so that figures of different machines compare. On a machine without a GPU the same call
 measures small sizes of what can run, and says what was not run.
@@ -55,7 +55,7 @@ class Measurement:
     unit: str
     """One of the batch."""
     ms: float
-    """Of a batch: the median over the repeats."""
+    """Time of a batch: the median over the repeats."""
     memory_mb: float | None
     """Most memory of the device that torch took; None where that is not known."""
 
@@ -74,7 +74,7 @@ class DeviceBenchmark:
     platform: dict[str, Any]
     rows: list[Measurement]
     not_run: list[str]
-    """What was not measured, and why."""
+    """Measurements left out, and why."""
     notes: list[str] = field(default_factory=list)
 
     def to_json(self) -> str:

@@ -31,7 +31,7 @@ class NetworkCase:
     unit: str
     """One row of the batch."""
     roll_out: Callable[..., Any] | None = None
-    """What is done when it is used, if that is more than one pass."""
+    """Work done when it is used, if that is more than one pass."""
 
 
 def list_cases() -> dict[str, NetworkCase]:
