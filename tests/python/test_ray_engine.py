@@ -15,6 +15,7 @@ from types import SimpleNamespace
 
 import pytest
 from fakes import LineAgent, LineTask
+from run_facts import list_facts
 
 from wiw.cli import main
 from wiw.errors import ArgumentError, ContractError, DependencyError, InfrastructureError, StoreError
@@ -31,17 +32,11 @@ from wiw.types import EpisodeResult
 TASK = f"{Path(__file__).with_name('fakes.py')}:line_task"
 
 
-def facts(run):
-    log = load_run(run)
-    rows = [*log.episodes, *log.decisions]
-    return [{name: value for name, value in row.items() if name not in ("seconds", "spent", "calls")} for row in rows]
-
-
 @pytest.fixture(scope="module")
 def reference(tmp_path_factory):
     out = tmp_path_factory.mktemp("reference") / "run"
     run_arms(LineTask(), {"none": LineAgent(0.5), "warp": LineAgent(0.8)}, 10, out=out, progress=False).close()
-    return facts(out)
+    return list_facts(out)
 
 
 def run_line(out, workers=2, **options):
@@ -52,14 +47,14 @@ def run_line(out, workers=2, **options):
 @pytest.mark.parametrize("workers", [1, 2])
 def test_one_and_two_actors_record_what_one_process_does(ray, reference, tmp_path, workers):
     run_line(tmp_path / "run", workers).close()
-    assert facts(tmp_path / "run") == reference
+    assert list_facts(tmp_path / "run") == reference
     assert ray.is_initialized()  # it was there before
 
 
 def test_a_lost_actor_costs_the_episodes_in_flight_and_nothing_else(ray, reference, tmp_path):
     """Its process is killed at decision 1 of episode 6, once."""
     run_line(tmp_path / "run", kill=(6,), marker=str(tmp_path / "marker")).close()
-    assert facts(tmp_path / "run") == reference
+    assert list_facts(tmp_path / "run") == reference
 
 
 class ActorInThisProcess:
@@ -128,7 +123,7 @@ def test_actors_that_are_killed_at_any_time_change_nothing(ray, reference, tmp_p
 
     monkeypatch.setattr(ray_engine._ActorPool, "_receive", receive_and_kill)
     run_line(tmp_path / "run").close()
-    assert len(killed) == 5 and facts(tmp_path / "run") == reference
+    assert len(killed) == 5 and list_facts(tmp_path / "run") == reference
 
 
 def test_a_broken_contract_stops_the_run_as_in_this_process(ray, tmp_path):
@@ -182,7 +177,7 @@ def test_a_driver_that_is_stopped_is_resumed_in_processes(tmp_path):
     assert 3 <= count_ended(out) < 12
     resume_run(out, progress=False, engine={"engine": "processes"}).close()
     assert main([*command[:12], "--out", str(tmp_path / "whole"), "--no-report"]) == 0
-    assert facts(out) == facts(tmp_path / "whole")
+    assert list_facts(out) == list_facts(tmp_path / "whole")
 
 
 def count_ended(out):

@@ -8,7 +8,8 @@ import sys
 from pathlib import Path
 
 import pytest
-from test_ray_servers import facts, run_walk
+from run_facts import list_facts
+from test_ray_servers import run_walk
 
 from wiw.runs import ray_servers
 
@@ -50,4 +51,4 @@ def test_a_lost_node_takes_its_actor_and_its_server_with_it_and_nothing_else(clu
     monkeypatch.setattr(ray_servers.ServerPool, "note_progress", remove_once)
     run_walk(tmp_path / "run", engine="ray", workers=2, live=2, servers=2, server_gpus=1).close()
     assert len(set(removed[0])) == 2, "a server on each node, for each has one GPU"
-    assert facts(tmp_path / "run") == facts(tmp_path / "here")
+    assert list_facts(tmp_path / "run") == list_facts(tmp_path / "here")

@@ -15,6 +15,7 @@ from pathlib import Path
 import pytest
 import served_models
 from fakes import LineTask
+from run_facts import list_facts
 
 import wiw
 from wiw.cli import main
@@ -51,12 +52,6 @@ class Walker(wiw.Policy):
         return [np.array([float(each.frames.mean()) for each in plans]) for plans in rollouts]
 
 
-def facts(run):
-    log = load_run(run)
-    rows = [*log.episodes, *log.decisions]
-    return [{name: value for name, value in row.items() if name not in ("seconds", "spent", "calls")} for row in rows]
-
-
 @pytest.fixture(scope="module")
 def calls(tmp_path_factory):
     """The file in which served models note their calls, known to all processes of the cluster."""
@@ -82,7 +77,7 @@ def run_walk(out, **settings):
 def reference(ray, tmp_path_factory):
     out = tmp_path_factory.mktemp("reference") / "run"
     run_walk(out).close()
-    return facts(out)
+    return list_facts(out)
 
 
 SERVED = {"engine": "ray", "workers": 2, "live": 2, "servers": 2, "server_gpus": 0}
@@ -108,7 +103,7 @@ def wait_until(condition, seconds=30.0):
 
 def test_a_run_with_its_own_servers_records_what_one_process_does(ray, reference, tmp_path):
     run_walk(tmp_path / "run", **SERVED).close()
-    assert facts(tmp_path / "run") == reference
+    assert list_facts(tmp_path / "run") == reference
     log = load_run(tmp_path / "run")
     assert log.store.config["arms"][1]["agent"]["model"] == MODEL  # as it was named, whoever computes it
     assert log.store.info["engine"]["servers"] == 2
@@ -130,7 +125,7 @@ def test_servers_that_are_killed_come_back_and_nothing_is_lost(ray, reference, t
     before = count_calls()
     threading.Thread(target=kill, daemon=True).start()
     run_walk(tmp_path / "run", **SERVED).close()
-    assert len(killed) == 4 and facts(tmp_path / "run") == reference
+    assert len(killed) == 4 and list_facts(tmp_path / "run") == reference
 
 
 def count_calls():
@@ -152,7 +147,7 @@ def test_a_lost_actor_of_a_server_is_replaced_and_its_address_kept(ray, referenc
 
     monkeypatch.setattr(ray_servers.ServerPool, "note_progress", kill_once)
     run_walk(tmp_path / "run", **SERVED).close()
-    assert facts(tmp_path / "run") == reference
+    assert list_facts(tmp_path / "run") == reference
     assert len(seen) > 1 and all(each == seen[0] for each in seen)
 
 
@@ -174,7 +169,7 @@ def test_workers_begin_anew_where_a_server_has_moved(ray, reference, tmp_path, m
     monkeypatch.setattr(ray_servers.ServerPool, "_restart", move)
     monkeypatch.setattr(ray_servers.ServerPool, "note_progress", kill_once)
     run_walk(tmp_path / "run", **SERVED).close()
-    assert len(moved) == 1 and facts(tmp_path / "run") == reference
+    assert len(moved) == 1 and list_facts(tmp_path / "run") == reference
 
 
 MORTAL = """
@@ -235,7 +230,7 @@ def test_a_killed_driver_leaves_no_server_and_its_run_is_resumed(ray, reference,
     assert 10 <= count_ended(out) < 16
     wait_until(lambda: not list_servers(), 60)
     assert main(["resume", str(out), "--no-report"]) == 0
-    assert facts(out) == reference
+    assert list_facts(out) == reference
 
 
 def count_ended(out):
