@@ -417,17 +417,17 @@ f 1 2 6 5
 
 
 def test_each_task_names_the_policy_that_runs_it():
-    from wiw.cli.options import default_policy
     from wiw.registry import POLICIES, TASKS
+    from wiw.runs.recipes import TaskRecipe
 
-    found = [default_policy(name) for name in ("imagenav", "ar", "manipulation")]
+    found = [TaskRecipe(name).find_policy() for name in ("imagenav", "ar", "manipulation")]
     assert found == ["matcher", "recogniser", "scripted"]
     named = [name for name in TASKS.names() if TASKS.find(name).default_policy]
-    assert {default_policy(name) for name in named} <= set(POLICIES.names())
-    assert default_policy("imagenav", "foresight") == "navigator"
-    assert default_policy("ar", "foresight") == "recogniser"
+    assert {TaskRecipe(name).find_policy() for name in named} <= set(POLICIES.names())
+    assert TaskRecipe("imagenav", {"preset": "foresight"}).find_policy() == "navigator"
+    assert TaskRecipe("ar", {"preset": "foresight"}).find_policy() == "recogniser"
     with pytest.raises(ArgumentError, match="names no default"):
-        default_policy(f"{Path(__file__).parent / 'fakes.py'}:LineTask")
+        TaskRecipe(f"{Path(__file__).parent / 'fakes.py'}:LineTask").find_policy()
 
 
 def test_descriptions_of_flags_are_paragraphs(capsys):

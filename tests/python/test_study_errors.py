@@ -15,7 +15,7 @@ from wiw.errors import ArgumentError
 from wiw.experiments.errors import ERRORS
 from wiw.report.error_page import write_errors
 from wiw.report.error_tables import explain, print_errors
-from wiw.studies.errors import ErrorSettings, read_errors, study_errors
+from wiw.studies.errors import ErrorSettings, make_recipes, read_errors, study_errors
 
 ARMS = {"error-blur@64": ("blur", 64.0), "error-lag@2": ("lag", 2.0), "error-lag@4": ("lag", 4.0)}
 DISTANCE = {"error-blur@64": 0.5, "error-lag@2": 0.2, "error-lag@4": 0.4}
@@ -114,10 +114,22 @@ def test_errors_that_were_not_measured_are_drawn_without_costs(tmp_path: Path) -
     print_errors([found])
 
 
-@pytest.mark.parametrize("changes", [{"tasks": ("walking",)}, {"kinds": ()}, {"doses": 4}, {"episodes": 0}])
+@pytest.mark.parametrize(
+    "changes", [{"tasks": ("walking",)}, {"kinds": ()}, {"doses": 4}, {"episodes": 0}, {"tier": "beyond"}]
+)
 def test_settings_out_of_range_are_refused(changes: dict) -> None:
     with pytest.raises(ArgumentError, match="errors: expected"):
         ErrorSettings(**changes)
+
+
+def test_a_preset_and_a_tier_say_what_is_run() -> None:
+    settings = ErrorSettings(tasks=("imagenav",), preset="foresight", tier="beyond")
+    task, agent = make_recipes("imagenav", settings)
+    assert task.options == {"seed": 0, "per_scene": 2, "tier": "beyond", "preset": "foresight"}
+    assert agent.policy == settings.find_policy("imagenav") == "navigator"
+    assert ErrorSettings(preset="foresight", policy="matcher").find_policy("imagenav") == "matcher"
+    with pytest.raises(ArgumentError, match="manipulation: no preset 'foresight'"):
+        ErrorSettings(preset="foresight").find_policy("manipulation")
 
 
 def test_what_makes_no_sense_is_left_out_by_name() -> None:

@@ -80,19 +80,3 @@ def task_options(task: str, pairs: Sequence[str], flags: Mapping[str, Any]) -> d
         if name in flags:
             raise ArgumentError(f"--task-option: '{name}' has a flag of its own, --{name.replace('_', '-')}")
     return {**{name: value for name, value in flags.items() if value is not None}, **options}
-
-
-def default_policy(task: str, preset: str | None = None) -> str:
-    """Return the policy that runs a task where `--policy` names none: the preset's, or else the task's.
-
-    Raises:
-        ArgumentError: they name none either; or no such preset.
-    """
-    from wiw.registry import task_class
-    from wiw.tasks.presets import DEFAULT, find_owner, load_preset
-
-    kind = task_class(task)
-    name = load_preset(find_owner(kind), preset or DEFAULT).policy or kind.default_policy
-    if name is None:
-        raise ArgumentError(f"--policy: task '{task}' names no default; choose one of `wiw list policies`")
-    return str(name)

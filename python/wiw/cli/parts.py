@@ -10,15 +10,7 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 from tyro.conf import arg
 
-from wiw.cli.options import (
-    Options,
-    default_policy,
-    model_options,
-    policy_options,
-    semantics_options,
-    task_options,
-    tracker_options,
-)
+from wiw.cli.options import Options, model_options, policy_options, semantics_options, task_options, tracker_options
 from wiw.errors import ArgumentError
 from wiw.loop.config import PlanConfig
 
@@ -126,14 +118,14 @@ class AgentFlags:
         Raises:
             ArgumentError: options without the part that takes them; a width without depth.
         """
-        from wiw.runs.recipes import AgentRecipe, absolute
+        from wiw.runs.recipes import AgentRecipe, TaskRecipe, absolute
 
         if search.width is not None and search.depth == 1:
             raise ArgumentError(
                 "--width: a search of one level extends no plan; give --depth 2 or more, or leave it out"
             )
         policy, reviser = (
-            absolute(self.policy or default_policy(task, preset)),
+            absolute(self.policy or TaskRecipe(task, {"preset": preset}).find_policy()),
             self.revision and absolute(self.revision),
         )
         options = policy_options(policy, self.policy_option, self._vlm_options([policy, reviser or "", *policies]))

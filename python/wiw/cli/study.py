@@ -5,7 +5,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Annotated, Any, Literal
 
 from tyro.conf import arg
 
@@ -101,6 +101,8 @@ def study_errors(
     seed: Annotated[int | None, arg(metavar="N")] = None,
     scenes: Annotated[str | None, arg(metavar="SPEC")] = None,
     per_scene: Annotated[int | None, arg(metavar="N")] = None,
+    preset: Annotated[str | None, arg(metavar="NAME|FILE")] = None,
+    tier: Literal["near", "far", "beyond", "all"] | None = None,
     policy: Annotated[str | None, arg(metavar="NAME")] = None,
     size: Annotated[tuple[int, int] | None, arg(metavar="H W")] = None,
     fidelity_share: Annotated[float | None, arg(metavar="SHARE")] = None,
@@ -112,6 +114,7 @@ def study_errors(
 
     $ wiw study errors --small --workers 2                     # imagenav, four errors; about three minutes on two cores
     $ wiw study errors --tasks imagenav --size 144 256 --workers 4
+    $ wiw study errors --tasks imagenav --preset foresight --tier beyond --size 144 256
     $ wiw study errors --workers 16 --lpips auto               # all tasks, errors and doses: hours
     $ wiw study errors --tasks ar --read-only                  # tables and page of what has been run so far
 
@@ -135,7 +138,9 @@ def study_errors(
         seed: Of all randomness; 0 if not given.
         scenes: As in `wiw run`, of tasks in which an agent walks.
         per_scene: Episodes in a scene; 2 if not given, as intervals are over scenes.
-        policy: The task's own if not given.
+        preset: Rules of the tasks, as in `wiw run`; each task's default if not given.
+        tier: Of imagenav, as in `wiw run`.
+        policy: The preset's, or else the task's own, if not given.
         size: Height and width of the oracle's frames; 576 1024, or 480 480 before a table, if not given. The policy
             matcher looks at 64x128, so that less is enough and several times faster.
         fidelity_share: Share of the decisions at which regret and distances are measured; 0.25 if not given.
@@ -160,6 +165,8 @@ def study_errors(
         "seed": seed,
         "scenes": scenes,
         "per_scene": per_scene,
+        "preset": preset,
+        "tier": tier,
         "policy": policy,
         "size": size,
         "fidelity_share": fidelity_share,

@@ -59,6 +59,22 @@ class TaskRecipe:
 
         return cast(Task, TASKS.make(self.name, **self.options))
 
+    def find_policy(self) -> str:
+        """Return the policy that runs the task where nobody names one: the preset's, or else the task's.
+
+        Raises:
+            ArgumentError: they name none either; or no such preset.
+        """
+        from wiw.registry import task_class
+        from wiw.tasks.presets import DEFAULT, find_owner, load_preset
+
+        kind = task_class(self.name)
+        preset = load_preset(find_owner(kind), self.options.get("preset") or DEFAULT)
+        policy = preset.policy or kind.default_policy
+        if policy is None:
+            raise ArgumentError(f"--policy: task '{self.name}' names no default; choose one of `wiw list policies`")
+        return str(policy)
+
     def to_json(self) -> dict[str, Any]:
         """Return JSON for the run store, the same in any folder; `TaskRecipe(**...)` is the way back."""
         from wiw.registry import task_class

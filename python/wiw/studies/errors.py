@@ -59,8 +59,12 @@ class ErrorSettings:
     """Scenes of tasks in which an agent walks; the task's own if None."""
     per_scene: int = 2
     """Episodes in a scene, of tasks in which an agent walks."""
+    preset: str | None = None
+    """Rules of the tasks, by name or by the path of a YAML file (`wiw.tasks.presets`); each task's default if None."""
+    tier: str | None = None
+    """Of Image-Goal Navigation: near, far, beyond, or all; episodes of no tier if None."""
     policy: str | None = None
-    """The task's own if None."""
+    """The preset's, or else the task's own, if None."""
     size: tuple[int, int] | None = None
     """Height and width of the oracle's frames; its own if None."""
     fidelity_share: float = 0.25
@@ -76,6 +80,17 @@ class ErrorSettings:
                 f"errors: expected 1 to 3 doses and 1 or more episodes, in all and in a scene, got {self.doses}, "
                 f"{self.episodes} and {self.per_scene}"
             )
+
+        if self.tier is not None and self.tasks != ("imagenav",):
+            raise ArgumentError(f"errors: expected imagenav alone for a tier, got {', '.join(self.tasks)}")
+
+    def find_policy(self, task: str) -> str:
+        """Return the name of the policy that runs a task.
+
+        Raises:
+            ArgumentError: the task has no such preset.
+        """
+        return self.policy or TaskRecipe(task, {"preset": self.preset}).find_policy()
 
     def list_arms(self, task: str) -> dict[str, tuple[str, float]]:
         """Return kind and dose of the arms of a task that have an error, by arm."""
@@ -198,7 +213,7 @@ def _run_task(
     task: str, settings: ErrorSettings, folder: Path, workers: int, lpips: str | Path | None, watch: Watch
 ) -> list[Path]:
     """Run all arms of a task, part by part; return the folders of the runs."""
-    recipe, agent = _make_recipes(task, settings)
+    recipe, agent = make_recipes(task, settings)
     arms = [FLOOR, CEILING, *_order_arms(settings.list_arms(task))]
     count, salt = -(-settings.episodes // BLOCK), _find_salt(folder)
     shards = [Shard(number, count) for number in range(1, count + 1)]
@@ -250,13 +265,17 @@ def _order_arms(arms: Mapping[str, tuple[str, float]]) -> list[str]:
     return sorted(arms, key=lambda arm: -doses[arms[arm][0]].index(arms[arm][1]))
 
 
-def _make_recipes(task: str, settings: ErrorSettings) -> tuple[TaskRecipe, AgentRecipe]:
+def make_recipes(task: str, settings: ErrorSettings) -> tuple[TaskRecipe, AgentRecipe]:
+    """Return what the runs of a task are made by: the task, and the agent whose world model is the oracle."""
     walks = getattr(task_class(task), "space", PRIMITIVES) == PRIMITIVES
     options: dict[str, Any] = {"seed": settings.seed}
     if walks:
         options |= {"per_scene": settings.per_scene}
-        options |= {} if settings.scenes is None else {"scenes": settings.scenes}
-    policy = settings.policy or task_class(task).default_policy
+        named = {"scenes": settings.scenes, "tier": settings.tier}
+        options |= {name: value for name, value in named.items() if value is not None}
+    if settings.preset is not None:
+        options["preset"] = settings.preset
+    policy = settings.find_policy(task)
     return TaskRecipe(task, options), AgentRecipe(policy, "oracle", model_options=_size_option(settings))
 
 
@@ -278,7 +297,7 @@ def _read_task(task: str, settings: ErrorSettings, parts: Sequence[Path]) -> Err
             return None
         return summarise_errors(
             task,
-            settings.policy or str(task_class(task).default_policy),
+            settings.find_policy(task),
             [row for log in logs for row in log.store.outcomes()],
             (row for log in logs for row in log.store.decisions()),
             settings.list_arms(task),
