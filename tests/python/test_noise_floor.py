@@ -7,6 +7,7 @@ import pytest
 from fakes import LineTask, line_task  # noqa: F401 - the task is named by its path below
 
 import wiw
+from wiw.analysis.noise_floor import NoiseFloor, find_repeats
 from wiw.analysis.statistics import compare
 from wiw.analysis.summary import is_under_test, notes, role_of, split_outcomes, summarise
 from wiw.cli import main
@@ -59,7 +60,8 @@ def test_the_report_says_how_much_an_arm_differs_from_itself(tmp_path, capsys):
     assert executed["none"] != executed["reseeded:none"], "other draws"
     differing = sum(rows["none", i] != rows["reseeded:none", i] for i in range(24))
     (noise,) = log.numbers().noise
-    assert (noise.arm, noise.base) == ("reseeded:none", "none") and noise.wins + noise.losses == differing
+    found = noise.difference
+    assert (found.arm, found.base) == ("reseeded:none", "none") and found.wins + found.losses == differing
     (said,) = [note for note in notes(log.numbers()) if note.startswith("Noise floor")]
     same = "succeeds in the same 24 episodes" in said
     assert same if differing == 0 else f"in {differing} of 24 episodes" in said
@@ -83,8 +85,37 @@ def test_how_much_an_arm_differs_from_itself_is_said(first, again, expected):
     ]
     done, _ = split_outcomes(list(arms), rows)
     found = compare("reseeded:mine", "mine", done, SUCCESS)
-    said = notes(replace(summarise(list(arms), rows, 6), noise=(found,)))
-    assert any(note.startswith("Noise floor") and expected in note for note in said)
+    said = notes(replace(summarise(list(arms), rows, 6), noise=(NoiseFloor("with frames of 8x16", found),)))
+    assert any(note.startswith("Noise floor: with frames of 8x16 mine") and expected in note for note in said)
+
+
+SMALL, LARGE = {"size": [144, 256]}, {"size": [288, 512]}
+
+
+@pytest.mark.parametrize(
+    ("models", "expected"),
+    [
+        ({"small": ("warp", SMALL), "warp": ("warp", {})}, [("small", "warp", "144x256")]),
+        ({"big": ("warp", LARGE), "small": ("warp", SMALL)}, [("small", "big", "144x256")]),
+        (
+            {"small": ("warp", SMALL), "big": ("warp", LARGE), "warp": ("warp", {})},
+            [("small", "warp", "144x256"), ("big", "warp", "288x512")],
+        ),
+        ({"warp": ("warp", SMALL), "oracle": ("oracle", {}), "none": (None, {})}, []),
+        ({"a": ("warp", {**SMALL, "fill": "far"}), "b": ("warp", {})}, []),
+        ({"a": ("warp", SMALL), "b": ("warp", SMALL)}, []),
+    ],
+)
+def test_arms_of_one_model_and_several_sizes_are_repeats(models, expected):
+    agents = {
+        name: {"policy": "matcher", **({"model": model} if model else {}), **({"model_options": how} if how else {})}
+        for name, (model, how) in models.items()
+    }
+    found = [(each.arm, each.base, each.change.removeprefix("with frames of ")) for each in find_repeats(agents)]
+    assert found == expected
+    more = {**agents, "again": {**agents[next(iter(agents))], "reseed": 1}}
+    repeats = [each for each in find_repeats(more) if "random" in each.change]
+    assert [(each.arm, each.base) for each in repeats] == [("again", next(iter(agents)))]
 
 
 def test_runs_without_repeats_say_nothing(tmp_path):

@@ -24,10 +24,11 @@ from wiw.analysis.breakdowns import (
 )
 from wiw.analysis.flip_test import FEWEST_SCENES
 from wiw.analysis.marks import BLIND, Marks, answer_blind, read_marks
+from wiw.analysis.noise_floor import NoiseFloor, measure_noise
 from wiw.analysis.statistics import LEVEL, Difference, Estimate, adjust_p_values, compare, estimate_mean
 from wiw.analysis.utility import CEILING, FLOOR, Utility, utility
 from wiw.errors import RegistryError
-from wiw.metrics.metric import ANSWER_SCORE, SPL, SPL_RULE, SUCCESS, Metric
+from wiw.metrics.metric import ANSWER_SCORE, SPL, SPL_RULE, Metric
 from wiw.registry import METRICS
 from wiw.runs.departures import Departure, read_departures
 from wiw.runs.judges import JudgeRecord
@@ -135,8 +136,8 @@ class Summary:
     """Trackers of targets in imagined frames by name, each with "frames" or "poses", whichever it followed."""
     looks: str = field(default="", kw_only=True)
     """Sentences on the rule by which the run was to stop early, and on whether it did; empty without one."""
-    noise: tuple[Difference, ...] = field(default=(), kw_only=True)
-    """Each arm that repeats another, minus that one."""
+    noise: tuple[NoiseFloor, ...] = field(default=(), kw_only=True)
+    """How much each arm that repeats another differs from that one."""
     departures: tuple[Departure, ...] = field(default=(), kw_only=True)
     """Where the run departs from the paper's protocol."""
     tiers: Mapping[str, Summary] = field(default_factory=dict, kw_only=True)
@@ -290,38 +291,21 @@ def summarise_run(run: Run) -> Summary:
         trackers=_list_trackers(run),
         departures=read_departures(run.store.info),
         looks=_describe_looks(run.store.info),
-        noise=measure_noise(run),
+        noise=measure_noise(run.store.config["arms"], split_outcomes(run.arms, outcomes)[0], run.store.config["seed"]),
         tiers=tiers,
     )
 
 
-def measure_noise(run: Run) -> tuple[Difference, ...]:
-    """Return how each arm that repeats another one of the run with other random numbers differs from that one in SR."""
-    agents = {arm["name"]: dict(arm["agent"]) for arm in run.store.config["arms"]}
-    repeats = {name: agent.pop("reseed", None) for name, agent in agents.items()}
-    pairs = [
-        (arm, other)
-        for arm in agents
-        for other in agents
-        if repeats[arm] is not None and repeats[other] is None and agents[arm] == agents[other]
-    ]
-    if not pairs:
-        return ()
-    done, _ = split_outcomes(run.arms, run.store.outcomes())
-    found = [compare(arm, other, done, SUCCESS, run.store.config["seed"]) for arm, other in pairs]
-    return tuple(one for one in found if one is not None)
-
-
-def _describe_noise(found: Difference) -> str:
+def _describe_noise(noise: NoiseFloor) -> str:
     """Return how much an arm differs from itself, in a sentence or two."""
-    estimate, differing = found.estimate, found.wins + found.losses
+    found, said = noise.difference, f"Noise floor: {noise.change} {noise.difference.base}"
+    differing = found.wins + found.losses
     if not differing:
-        same = f"Noise floor: with other random numbers {found.base} succeeds in the same {estimate.n} episodes."
-        return f"{same} What policy and model draw makes no difference here."
+        return f"{said} succeeds in the same {found.estimate.n} episodes. This makes no difference here."
     return (
-        f"Noise floor: with other random numbers {found.base} differs from itself in {differing} of {estimate.n} "
-        f"episodes ({found.wins} won, {found.losses} lost), SR by {show_estimate(estimate, signed=True)} points. A "
-        "difference between arms that is no larger may be the draw's."
+        f"{said} differs from itself in {differing} of {found.estimate.n} episodes ({found.wins} won, {found.losses} "
+        f"lost), SR by {show_estimate(found.estimate, signed=True)} points. A difference between arms that is no "
+        "larger may be due to this alone."
     )
 
 

@@ -48,7 +48,7 @@ def run(
     $ wiw run imagenav --world-model my_model.py:MyModel --arms none,oracle,heuristic+none
     $ wiw run imagenav --arms none,big=warpnet?weights=big.npz,small=warpnet?weights=small.npz,oracle
     $ wiw run imagenav --scenes house.glb --world-model warp
-    $ wiw run imagenav --tier all --episodes 180 --arms none,warp,oracle
+    $ wiw run imagenav --preset foresight --tier all --episodes 180 --arms none,warp,oracle
     $ wiw run imagenav --episode-file val.json.gz --scene-folder scans
     $ wiw run ar --policy vlm --vlm http://localhost:8000/v1 --world-model warp
     $ wiw run manipulation --tasks push_buttons,stack_cups --episodes 40 --arms none,copy,oracle
