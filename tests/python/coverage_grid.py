@@ -31,8 +31,11 @@ PAIRS = {
     f"{won} % won, {lost} % lost": [won / 100, lost / 100, 1 - (won + lost) / 100]
     for won, lost in ((5, 0), (10, 0), (36, 2), (10, 3), (10, 10), (30, 30))
 }
-LENGTHS = {"60 in 80 %, else 10 to 50": ([0.8, 0.05, 0.05, 0.05, 0.05], [60.0, 50.0, 40.0, 20.0, 10.0])}
-"""Actions of episodes of which most end at the budget: shares and values."""
+LENGTHS = {
+    "60 in 80 %, else 10 to 50": ([0.8, 0.05, 0.05, 0.05, 0.05], [60.0, 50.0, 40.0, 20.0, 10.0]),
+    "5 in 80 %, else 10 to 60": ([0.8, 0.1, 0.05, 0.05], [5.0, 10.0, 40.0, 60.0]),
+}
+"""Actions of episodes of which most end at the budget, or at once: shares and values."""
 
 
 def truths() -> list[tuple[str, list[float], list[float], Kind]]:
@@ -63,8 +66,8 @@ def measure_coverage(
 ) -> tuple[float, float]:
     """Percent of runs whose 95 % interval holds the truth, and the interval's mean width (in percent for rates)."""
     sums, squares = draw_sums(shares, values, sizes, correlation, runs)
-    span = max(values) if kind == "length" else 1.0  # lengths begin at 0
-    low, high = interval_of_sums(sums, squares, np.asarray(sizes, np.float64), kind, 0.95, span)
+    reach = (0.0, max(values))  # of lengths
+    low, high = interval_of_sums(sums, squares, np.asarray(sizes, np.float64), kind, 0.95, reach)
     truth = float(np.dot(shares, values))
     held = (low <= truth + 1e-9) & (truth - 1e-9 <= high)
     return 100 * float(np.mean(held)), (1.0 if kind == "length" else 100) * float(np.mean(high - low))

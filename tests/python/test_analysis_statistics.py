@@ -14,6 +14,7 @@ from wiw.analysis.flip_test import DRAWS, approximate_flips, find_p_value, flip_
 from wiw.analysis.intervals import (
     clustered_bootstrap,
     clustered_interval,
+    count_degrees,
     count_effective,
     design_effect,
     interval_of_sums,
@@ -129,9 +130,9 @@ def test_which_test_is_used():
 def test_p_is_where_the_interval_ends_at_zero(kind):
     rng = np.random.default_rng(6)
     sums, counts = rng.integers(-1, 4, 6).astype(float), np.array([4.0, 5, 5, 6, 5, 4])
-    squares, span = float(np.abs(sums).sum()) + 4, 1.5
-    p_value = float(p_value_of_sums(sums, squares, counts, kind, span))
-    low, high = interval_of_sums(sums, squares, counts, kind, 1 - p_value, span)
+    squares, reach = float(np.abs(sums).sum()) + 4, (-0.75, 0.75)
+    p_value = float(p_value_of_sums(sums, squares, counts, kind, reach))
+    low, high = interval_of_sums(sums, squares, counts, kind, 1 - p_value, reach)
     assert min(abs(low), abs(high)) < 1e-6 and 0 < p_value < 1
 
 
@@ -289,17 +290,32 @@ def test_variance_over_scenes_is_the_cluster_robust_one_of_statsmodels():
     assert jackknife_covariance(sums, sums, counts) == pytest.approx(fit.bse[0] ** 2)
 
 
-def test_lengths_over_scenes_are_students_but_for_the_made_up_episodes():
-    data = np.random.default_rng(6).normal(40, 9, 23)
+def test_lengths_over_many_scenes_are_students() -> None:
+    data = np.random.default_rng(6).normal(40, 9, 2000)
     expected = stats.ttest_1samp(data, 0).confidence_interval()
-    assert clustered_interval(data, np.arange(23), "length", span=0.0) == pytest.approx((40, 40), abs=10)
-    many = clustered_interval(np.tile(data, 200), np.tile(np.arange(23), 200), "length")
-    assert many == pytest.approx((expected.low, expected.high), abs=0.3)
+    found = clustered_interval(data, np.arange(2000), "length", reach=(0.0, 80.0))
+    assert found == pytest.approx((expected.low, expected.high), abs=0.02)
+
+
+def test_made_up_lengths_are_as_many_scenes_worth() -> None:
+    """By hand: every episode thrice, as scenes of three; a made-up one then counts for three, at 0 and at 60."""
+    once = np.array([60.0, 60, 60, 60, 20, 60, 60, 50])
+    data, scenes = np.repeat(once, 3), np.repeat(np.arange(8), 3)
+    sums, counts = sum_by_cluster(data, scenes)
+    effect = float(design_effect(sums, np.square(data).sum(), counts, 60.0))
+    weight = 2 * effect
+    center = (data.sum() + weight * 30) / (24 + weight)
+    variance = (np.square(data).sum() + weight * 1800) / (24 + weight) - center**2
+    half = stats.t.ppf(0.975, count_degrees(sums, counts)) * math.sqrt(effect * variance / (24 + weight))
+    assert 2.5 < effect < 4
+    low, high = clustered_interval(data, scenes, "length", reach=(0.0, 60.0))
+    assert (low, high) == pytest.approx((center - half, max(center + half, data.mean())))
+    assert center < data.mean() < high
 
 
 def test_lengths_that_are_all_alike_are_no_certainty():
     found = estimate_mean([60.0] * 4, list("abcd"), TRAJ)
-    assert found.value == 60 and found.low < 40 and found.high > 80
+    assert found.value == 60 and found.low < 40 and found.high > 75
     same = estimate_difference([60.0] * 4, [60.0] * 4, list("abcd"), TRAJ)
     assert same.low < -10 and same.high > 10
     one = estimate_mean([60.0] * 4, ["a"] * 4, TRAJ)

@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 from scipy import special
 
-from wiw.analysis.intervals import Array, Kind, p_value_of_sums, sum_by_cluster
+from wiw.analysis.intervals import Array, Interval, Kind, p_value_of_sums, sum_by_cluster
 
 FEWEST_SCENES = 8
 """Scenes from which on they are flipped: with fewer, too few flips are possible for a small p."""
@@ -26,7 +26,7 @@ DRAWS = 20_000
 
 
 def find_p_value(
-    differences: ArrayLike, scenes: Sequence[str], kind: Kind, span: float = 0.0, *, seed: int = 0
+    differences: ArrayLike, scenes: Sequence[str], kind: Kind, reach: Interval = (0.0, 0.0), *, seed: int = 0
 ) -> float:
     """Return the two-sided p of no difference, with scenes as what is drawn at random.
 
@@ -37,7 +37,7 @@ def find_p_value(
         differences: float [n], arm minus base, one an episode.
         scenes: [n] labels.
         kind: "difference" (of rates) or "length".
-        span: width of the range in which lengths lie.
+        reach: least and greatest possible difference of lengths.
         seed: of the flips, where not all are tried.
     """
     data = np.asarray(differences, np.float64)
@@ -45,7 +45,7 @@ def find_p_value(
     if len(sums) == 1:
         return flip_signs(data, seed)
     if len(sums) < FEWEST_SCENES:
-        return float(p_value_of_sums(sums, np.square(data).sum(), counts, kind, span))
+        return float(p_value_of_sums(sums, np.square(data).sum(), counts, kind, reach))
     return flip_signs(sums, seed)
 
 

@@ -28,8 +28,9 @@ COINS = {"rate": (0.5, 0.5), "difference": (0.0, 0.5)}
 USUAL_CORRELATION, USUAL_WEIGHT = 0.2, 0.25
 """Correlation within scenes that is assumed where the outcomes hardly vary, and the sum of squared deviations that this
 assumption counts for. Few successes cannot show whether they gather in few scenes."""
-LENGTH_WEIGHT = 4
-"""Made-up episodes that steady lengths, two at either end of their range, as Agresti and Coull (1998) have it."""
+LENGTH_WEIGHT = 2
+"""Made-up episodes that steady lengths, one at either end of their range, each worth as many as the scenes leave of one
+(as Agresti and Coull, 1998, do for proportions with four)."""
 HALVINGS = 40
 """Steps of the bisection for an end of Tango's interval: to 2e-12."""
 
@@ -85,7 +86,7 @@ def score_difference(mean: ArrayLike, mean_square: ArrayLike, n: ArrayLike, quan
 
 
 def clustered_interval(
-    values: ArrayLike, clusters: ArrayLike, kind: Kind, confidence: float = 0.95, span: float | None = None
+    values: ArrayLike, clusters: ArrayLike, kind: Kind, confidence: float = 0.95, reach: Interval | None = None
 ) -> Interval:
     """Return the interval of the pooled mean with clusters as the sampling unit; see `interval_of_sums`.
 
@@ -94,7 +95,7 @@ def clustered_interval(
         clusters: [n] labels, e.g. scenes; at least two distinct ones.
         kind: what the values are; the interval stays in their range.
         confidence: e.g. 0.95.
-        span: width of the range in which lengths lie; that of the values if not given.
+        reach: least and greatest possible length; those of the values if not given.
 
     Raises:
         ArgumentError: fewer than two clusters.
@@ -103,7 +104,7 @@ def clustered_interval(
     sums, counts = sum_by_cluster(data, np.asarray(clusters))
     if len(sums) < 2:
         raise ArgumentError(f"clustered_interval: expected at least 2 clusters, got {len(sums)}")
-    reach = float(np.ptp(data)) if span is None else span
+    reach = (float(data.min()), float(data.max())) if reach is None else reach
     low, high = interval_of_sums(sums, np.square(data).sum(), counts, kind, confidence, reach)
     return float(low), float(high)
 
@@ -114,7 +115,7 @@ def interval_of_sums(
     counts: Array,
     kind: Kind,
     confidence: float = 0.95,
-    span: float = 0.0,
+    reach: Interval = (0.0, 0.0),
 ) -> tuple[Array, Array]:
     """Return both ends of `clustered_interval`, for many runs at once.
 
@@ -122,7 +123,7 @@ def interval_of_sums(
     with Student's quantile for as many degrees of freedom as the scenes have; never narrower than the score interval
     over all n episodes as if they were independent. So Korn and Graubard (1998) do with Clopper and Pearson's interval.
     For lengths it is Student's t interval over clusters with the same D, steadied by made-up episodes at either end of
-    their range, and no wider than the range to either side.
+    their range; it holds the mean, and is no wider than the range to either side.
 
     Args:
         sums: float [..., clusters] of the values in each.
@@ -130,14 +131,15 @@ def interval_of_sums(
         counts: float [clusters], episodes in each.
         kind: see `clustered_interval`.
         confidence: e.g. 0.95.
-        span: width of the range in which lengths lie.
+        reach: least and greatest possible length.
     """
     n = counts.sum()
     mean, mean_square = sums.sum(-1) / n, np.asarray(squares, np.float64) / n
     quantile = special.stdtrit(count_degrees(sums, counts), 0.5 + confidence / 2)
     if kind == "length":
-        half = np.minimum(quantile * np.sqrt(steady_variance(sums, squares, counts, span)), span)
-        return mean - half, mean + half
+        center, variance = steady_length(sums, squares, counts, reach)
+        half, span = quantile * np.sqrt(variance), reach[1] - reach[0]
+        return np.clip(center - half, mean - span, mean), np.clip(center + half, mean, mean + span)
     effect = design_effect(sums, squares, counts)
     plain = np.full_like(mean, special.ndtri(0.5 + confidence / 2))
     sizes, quantiles = np.stack([n / effect, np.full_like(mean, n)]), np.stack([quantile + 0 * plain, plain])
@@ -148,7 +150,7 @@ def interval_of_sums(
     return low.min(0), high.max(0)
 
 
-def p_value_of_sums(sums: Array, squares: ArrayLike, counts: Array, kind: Kind, span: float = 0.0) -> Array:
+def p_value_of_sums(sums: Array, squares: ArrayLike, counts: Array, kind: Kind, reach: Interval = (0.0, 0.0)) -> Array:
     """Return the two-sided p of a mean of 0: 1 - the confidence at which `interval_of_sums` ends there.
 
     Args:
@@ -156,28 +158,35 @@ def p_value_of_sums(sums: Array, squares: ArrayLike, counts: Array, kind: Kind, 
         squares: as there.
         counts: as there.
         kind: "difference" or "length".
-        span: as there.
+        reach: as there.
     """
     n, total = counts.sum(), sums.sum(-1)
+    center, effect = total / n, np.ones_like(total)
     if kind == "length":
-        variance, effect = steady_variance(sums, squares, counts, span), np.ones_like(total)
+        center, variance = steady_length(sums, squares, counts, reach)
     else:  # the score test: the variance is the one of a mean of 0
         variance = np.maximum(np.asarray(squares, np.float64), np.abs(total)) / n**2
         effect = np.maximum(design_effect(sums, squares, counts), 0)
     error = np.sqrt(np.where(variance > 0, variance, np.inf))
-    ratio = np.abs(total) / n / error
+    ratio = np.abs(center) / error
     p_value = 2 * special.stdtr(count_degrees(sums, counts), -ratio / np.sqrt(np.where(effect > 0, effect, 1e-12)))
     found: Array = p_value if kind == "length" else np.maximum(p_value, 2 * special.ndtr(-ratio))
     return found
 
 
-def steady_variance(sums: Array, squares: ArrayLike, counts: Array, span: float) -> Array:
-    """Return the variance of a mean length by clusters, with made-up episodes at either end of the range."""
-    n, mean = counts.sum(), sums.sum(-1) / counts.sum()
-    added = LENGTH_WEIGHT * span**2 / 4
-    apart = np.maximum(np.asarray(squares, np.float64) - n * mean**2, 0)
-    found: Array = design_effect(sums, squares, counts, span) * (apart + added) / n**2
-    return found
+def steady_length(sums: Array, squares: ArrayLike, counts: Array, reach: Interval) -> tuple[Array, Array]:
+    """Return the mean length and its variance by clusters, with made-up episodes at either end of the range.
+
+    They draw the interval towards the middle of the range, where the mean of lengths that mostly lie at one end is more
+    likely to be than the values show.
+    """
+    low, high = reach
+    effect = np.maximum(design_effect(sums, squares, counts, high - low), 1.0)
+    weight = LENGTH_WEIGHT * effect
+    n = counts.sum() + weight
+    center = (sums.sum(-1) + weight * (low + high) / 2) / n
+    mean_square = (np.asarray(squares, np.float64) + weight * (low**2 + high**2) / 2) / n
+    return center, effect * np.maximum(mean_square - center**2, 0) / n
 
 
 def count_effective(counts: Array) -> float:

@@ -79,7 +79,7 @@ def estimate_mean(values: ArrayLike, scenes: Sequence[str], metric: Metric, *, s
     """Return the mean over episodes with a 95 % interval over scenes (`intervals`); `seed` is the bootstrap's."""
     data = np.asarray(values, np.float64)
     kind: Kind = "rate" if metric.kind == "rate" else "length"
-    found = _estimate(data, scenes, metric, kind, _measure_span(data, metric), seed)
+    found = _estimate(data, scenes, metric, kind, _find_reach(data, metric), seed)
     return replace(found, low=max(found.low, metric.scale * metric.least))
 
 
@@ -87,14 +87,14 @@ def estimate_difference(
     arm: ArrayLike, base: ArrayLike, scenes: Sequence[str], metric: Metric, *, seed: int = 0
 ) -> Estimate:
     """Return the mean paired difference, arm minus base, with a 95 % interval over scenes."""
-    data, kind, span = _subtract(arm, base, metric)
-    return _estimate(data, scenes, metric, kind, span, seed)
+    data, kind, reach = _subtract(arm, base, metric)
+    return _estimate(data, scenes, metric, kind, reach, seed)
 
 
 def compute_p_value(arm: ArrayLike, base: ArrayLike, scenes: Sequence[str], metric: Metric, *, seed: int = 0) -> float:
     """Return the two-sided p of no paired difference, by the test that knows scenes (`wiw.analysis.flip_test`)."""
-    data, kind, span = _subtract(arm, base, metric)
-    return find_p_value(data, scenes, kind, span, seed=seed)
+    data, kind, reach = _subtract(arm, base, metric)
+    return find_p_value(data, scenes, kind, reach, seed=seed)
 
 
 def _compute_anytime_p(arm: ArrayLike, base: ArrayLike, scenes: Sequence[str], metric: Metric) -> float:
@@ -107,17 +107,19 @@ def _compute_anytime_p(arm: ArrayLike, base: ArrayLike, scenes: Sequence[str], m
     return find_anytime_p([each.mean() for each in groups] if len(order) > 1 else data)
 
 
-def _subtract(arm: ArrayLike, base: ArrayLike, metric: Metric) -> tuple[NDArray[np.float64], Kind, float]:
-    """Return paired differences, their kind, and their span: as two arms scatter, the range's width times root 2."""
+def _subtract(arm: ArrayLike, base: ArrayLike, metric: Metric) -> tuple[NDArray[np.float64], Kind, Interval]:
+    """Return paired differences, their kind, and their reach: as two arms scatter, the range's width times root 2."""
     both = np.asarray(arm, np.float64), np.asarray(base, np.float64)
     kind: Kind = "difference" if metric.kind == "rate" else "length"
-    return both[0] - both[1], kind, math.sqrt(2) * _measure_span(np.concatenate(both), metric)
+    low, high = _find_reach(np.concatenate(both), metric)
+    half = math.sqrt(2) * (high - low) / 2
+    return both[0] - both[1], kind, (-half, half)
 
 
-def _measure_span(values: NDArray[np.float64], metric: Metric) -> float:
-    """Return the width of the range that values of a metric are known to have."""
+def _find_reach(values: NDArray[np.float64], metric: Metric) -> Interval:
+    """Return the range that values of a metric are known to have."""
     least = metric.least if math.isfinite(metric.least) else values.min()
-    return float(values.max() - least)
+    return float(least), float(values.max())
 
 
 def holm(p_values: ArrayLike) -> NDArray[np.float64]:
@@ -186,26 +188,26 @@ def compare(
 
 
 _OVER_SCENES = {"rate": "Wilson", "difference": "Tango", "length": "Student t"}
-_OVER_EPISODES: dict[Kind, Callable[[NDArray[np.float64], float], Interval]] = {
-    "rate": lambda data, span: wilson(float(data.mean()), len(data)),
-    "difference": lambda data, span: tango(data),
-    "length": lambda data, span: (
-        clustered_interval(data, np.arange(len(data)), "length", span=span) if len(data) > 1 else (math.nan, math.nan)
+_OVER_EPISODES: dict[Kind, Callable[[NDArray[np.float64], Interval], Interval]] = {
+    "rate": lambda data, reach: wilson(float(data.mean()), len(data)),
+    "difference": lambda data, reach: tango(data),
+    "length": lambda data, reach: (
+        clustered_interval(data, np.arange(len(data)), "length", reach=reach) if len(data) > 1 else (math.nan, math.nan)
     ),
 }
 
 
 def _estimate(
-    data: NDArray[np.float64], scenes: Sequence[str], metric: Metric, kind: Kind, span: float, seed: int
+    data: NDArray[np.float64], scenes: Sequence[str], metric: Metric, kind: Kind, reach: Interval, seed: int
 ) -> Estimate:
     groups, scale = len(set(scenes)), metric.scale
     second, name = None, _OVER_SCENES[kind]
     if groups > 1:
         name = f"{name} over {groups} scenes"
-        low, high = clustered_interval(data, list(scenes), kind, span=span)
+        low, high = clustered_interval(data, list(scenes), kind, reach=reach)
         bootstrap = clustered_bootstrap(data, list(scenes), seed=seed)
         second = scale * bootstrap[0], scale * bootstrap[1]
     else:
-        low, high = _OVER_EPISODES[kind](data, span)
+        low, high = _OVER_EPISODES[kind](data, reach)
     effective = count_effective(sum_by_cluster(data, np.asarray(scenes))[1])
     return Estimate(scale * float(data.mean()), scale * low, scale * high, len(data), groups, name, second, effective)
