@@ -178,6 +178,18 @@ def _draw_boxes(observation: Observation, target: Target) -> dict[str, Any]:
 
 
 @dataclass(frozen=True)
+class CameraView:
+    """What a manipulator perceives by a camera other than the fixed front one."""
+
+    image: NDArray[np.uint8]
+    """uint8 [480, 480, 3]."""
+    T_world_camera: NDArray[np.float64]
+    """float64 [4, 4]: the camera looks along -z with +y up."""
+    depth: NDArray[np.float32] | None = None
+    """float32 [480, 480] planar z in metres, 0 where nothing is hit; None unless asked for."""
+
+
+@dataclass(frozen=True)
 class ArmObservation:
     """What a manipulator perceives; its goals are in words and its plans are poses."""
 
@@ -189,11 +201,19 @@ class ArmObservation:
     """float32 [480, 480] planar z in metres of the front view, 0 where nothing is hit; None unless asked for."""
     places: Mapping[str, NDArray[np.float64]] = field(default_factory=dict)
     """float64 [4, 4] by name: the objects' exact poses, which the paper gives policies that cannot see them so well."""
+    wrist: CameraView | None = None
+    """The camera on the hand; None unless asked for."""
 
     def as_dict(self) -> dict[str, Any]:
-        """Return the observation as gymnasium spaces see it; `depth` only where present."""
-        values: dict[str, Any] = {"front": self.front, "pose": self.pose}
-        return values if self.depth is None else {**values, "depth": self.depth}
+        """Return the observation as gymnasium spaces see it; `depth`, `wrist` and `wrist_depth` only where present."""
+        wrist = self.wrist
+        more = {
+            "depth": self.depth,
+            "wrist": None if wrist is None else wrist.image,
+            "wrist_depth": None if wrist is None else wrist.depth,
+        }
+        found = {name: image for name, image in more.items() if image is not None}
+        return {"front": self.front, "pose": self.pose, **found}
 
 
 @dataclass(frozen=True)

@@ -21,6 +21,7 @@ from hypothesis import strategies as st
 import wiw
 from wiw.cli import main
 from wiw.datasets import shards
+from wiw.datasets.demonstration import decode_colors, decode_depths
 from wiw.datasets.demonstrations import (
     DEPTH_UNITS,
     Demonstration,
@@ -41,6 +42,8 @@ from wiw.training.recording import FIRST_SEED, choose_end_frames, table_seed
 parquet = pytest.importorskip("pyarrow.parquet", reason="needs wiw[export]")
 
 SMALL: dict[str, Any] = {"episodes": 1, "size": 64, "frames": 16, "seed": 5, "backend": "cpu"}
+WHOLE = {**SMALL, "format": "png", "depth": True, "wrist": True}
+"""With all that can be recorded."""
 TASKS = ("slide_block", "push_buttons", "insert_peg")
 
 
@@ -48,7 +51,7 @@ TASKS = ("slide_block", "push_buttons", "insert_peg")
 def collected(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """Files that nothing disturbed."""
     folder = tmp_path_factory.mktemp("demos")
-    wiw.collect(folder, TASKS, format="png", depth=True, **SMALL)
+    wiw.collect(folder, TASKS, **WHOLE)
     return folder
 
 
@@ -80,6 +83,13 @@ def test_a_demonstration_is_what_happens_at_its_table(collected: Path, task: str
         np.testing.assert_array_equal(each.images[frame], seen["color"])
         assert each.depths is not None
         np.testing.assert_allclose(each.depths[frame], seen["depth"], atol=0.51 / DEPTH_UNITS)
+        by_hand = bench.render_view("wrist", (64, 64), ("color", "depth"))
+        assert each.encoded_wrist_images is not None and each.encoded_wrist_depths is not None
+        np.testing.assert_array_equal(decode_colors(each.encoded_wrist_images[frame : frame + 1])[0], by_hand["color"])
+        near = decode_depths(each.encoded_wrist_depths[frame : frame + 1])[0]
+        np.testing.assert_allclose(near, by_hand["depth"], atol=0.51 / DEPTH_UNITS)
+        assert each.wrist_poses is not None
+        np.testing.assert_array_equal(each.wrist_poses[frame], bench.get_camera_pose("wrist"))
     assert kind.is_success(bench, setup)
 
 
@@ -109,6 +119,16 @@ def test_files_are_plain_parquet_that_others_read(collected: Path) -> None:
     assert features["image"] == {"_type": "Image"} and features["pose"]["length"] == 7
 
 
+def test_the_wrist_camera_is_described_where_there_is_one(collected: Path, tmp_path: Path) -> None:
+    facts = Demonstrations(collected).files[0].facts["wrist_camera"]
+    assert facts["hfov_deg"] == 80 and "T_world_camera" not in facts
+    intrinsics = Demonstrations(collected).wrist_intrinsics
+    assert intrinsics is not None and intrinsics[0, 0] == pytest.approx(32 / np.tan(np.radians(40)))
+    wiw.collect(tmp_path, ["slide_block"], **SMALL)
+    plain = Demonstrations(tmp_path)
+    assert plain.wrist_intrinsics is None and plain[0].wrist_poses is None and "wrist" not in plain.config
+
+
 def test_its_camera_sees_things_where_they_are(collected: Path) -> None:
     demonstrations = Demonstrations(collected)
     camera = demonstrations.camera
@@ -122,12 +142,19 @@ def test_its_camera_sees_things_where_they_are(collected: Path) -> None:
 
 
 @settings(max_examples=25, deadline=None)
-@given(st.integers(1, 4), st.integers(1, 3), st.booleans(), st.sampled_from(["jpeg", "png"]), st.integers(0, 2**32))
+@given(
+    st.integers(1, 4),
+    st.integers(1, 3),
+    st.booleans(),
+    st.booleans(),
+    st.sampled_from(["jpeg", "png"]),
+    st.integers(0, 2**32),
+)
 def test_what_is_written_is_read(
-    tmp_path_factory: pytest.TempPathFactory, frames: int, count: int, depth: bool, kind: Any, seed: int
+    tmp_path_factory: pytest.TempPathFactory, frames: int, count: int, depth: bool, wrist: bool, kind: Any, seed: int
 ) -> None:
     rng = np.random.default_rng(seed)
-    written = [made_up(rng, frames, episode, depth, kind) for episode in range(count)]
+    written = [made_up(rng, frames, episode, depth, wrist, kind) for episode in range(count)]
     path = tmp_path_factory.mktemp("shard") / "made-00000.parquet"
     shards.write(path, written, {"failed": 3})
     shard = shards.Shard(path)
@@ -139,7 +166,15 @@ def test_what_is_written_is_read(
         assert read.images.shape == (frames, 8, 8, 3) and (read.depths is not None) == depth
 
 
-def made_up(rng: np.random.Generator, frames: int, episode: int, depth: bool, kind: Any) -> Demonstration:
+def make_pictures(rng: np.random.Generator, frames: int, kind: Any) -> tuple[bytes, ...]:
+    return tuple(encode_image(rng.integers(0, 256, (8, 8, 3)).astype(np.uint8), kind) for _ in range(frames))
+
+
+def make_depths(rng: np.random.Generator, frames: int) -> tuple[bytes, ...]:
+    return tuple(encode_depth(rng.random((8, 8)).astype(np.float32)) for _ in range(frames))
+
+
+def made_up(rng: np.random.Generator, frames: int, episode: int, depth: bool, wrist: bool, kind: Any) -> Demonstration:
     return Demonstration(
         task="made up",
         variation=int(rng.integers(50)),
@@ -153,12 +188,11 @@ def made_up(rng: np.random.Generator, frames: int, episode: int, depth: bool, ki
         actions=rng.normal(size=(frames, 7)),
         keys=rng.integers(0, 9, frames).astype(np.int32),
         ended=rng.integers(0, 2, frames).astype(bool),
-        encoded_images=tuple(
-            encode_image(rng.integers(0, 256, (8, 8, 3)).astype(np.uint8), kind) for _ in range(frames)
-        ),
-        encoded_depths=tuple(encode_depth(rng.random((8, 8)).astype(np.float32)) for _ in range(frames))
-        if depth
-        else None,
+        encoded_images=make_pictures(rng, frames, kind),
+        encoded_depths=make_depths(rng, frames) if depth else None,
+        encoded_wrist_images=make_pictures(rng, frames, kind) if wrist else None,
+        encoded_wrist_depths=make_depths(rng, frames) if depth and wrist else None,
+        wrist_poses=rng.normal(size=(frames, 4, 4)) if wrist else None,
     )
 
 
@@ -221,16 +255,14 @@ def test_failures_are_counted_and_kept_where_asked(tmp_path: Path, monkeypatch: 
 
 def test_any_number_of_workers_writes_the_same(collected: Path, tmp_path: Path) -> None:
     told: list[tuple[Any, ...]] = []
-    made = wiw.collect(
-        tmp_path, TASKS, format="png", depth=True, workers=2, progress=lambda *news: told.append(news), **SMALL
-    )
+    made = wiw.collect(tmp_path, TASKS, workers=2, progress=lambda *news: told.append(news), **WHOLE)
     assert contents(tmp_path) == contents(collected)
     assert sorted(told) == sorted((task, 1, 1, 0) for task in TASKS) and len(made) == 3
 
 
 @pytest.mark.parametrize("workers", [1, 2])
 def test_a_killed_collection_goes_on_and_ends_as_any_other(collected: Path, tmp_path: Path, workers: int) -> None:
-    asked = f"{str(tmp_path)!r}, {TASKS!r}, format='png', depth=True, workers={workers}, **{SMALL!r}"
+    asked = f"{str(tmp_path)!r}, {TASKS!r}, workers={workers}, **{WHOLE!r}"
     script = tmp_path.with_suffix(".py")
     script.write_text(f"import wiw\nif __name__ == '__main__':\n    wiw.collect({asked})\n")
     process = subprocess.Popen([sys.executable, str(script)], start_new_session=True)
@@ -241,7 +273,7 @@ def test_a_killed_collection_goes_on_and_ends_as_any_other(collected: Path, tmp_
     _gone(process.pid)
     (tmp_path / f".slide_block-00000.parquet.{process.pid}.part").write_bytes(b"half")
     assert len(Demonstrations(tmp_path, partial=True)) == len(list(tmp_path.glob("*.parquet")))
-    wiw.collect(tmp_path, TASKS, format="png", depth=True, **SMALL)
+    wiw.collect(tmp_path, TASKS, **WHOLE)
     assert contents(tmp_path) == contents(collected)
 
 
@@ -268,7 +300,7 @@ def test_a_finished_collection_is_left_alone_and_a_damaged_file_is_made_anew(col
     times = {path: path.stat().st_mtime_ns for path in tmp_path.iterdir()}
     damaged = tmp_path / "insert_peg-00000.parquet"
     damaged.write_bytes(damaged.read_bytes()[:-100])
-    wiw.collect(tmp_path, TASKS, format="png", depth=True, **SMALL)
+    wiw.collect(tmp_path, TASKS, **WHOLE)
     assert contents(tmp_path) == contents(collected)
     assert [path for path in times if path.stat().st_mtime_ns != times[path]] == [damaged]
 
@@ -377,7 +409,7 @@ def test_a_damaged_picture_is_told(collected: Path) -> None:
 
 
 def test_a_flipped_bit_is_told(tmp_path: Path) -> None:
-    each = made_up(np.random.default_rng(0), 3, 0, True, "jpeg")
+    each = made_up(np.random.default_rng(0), 3, 0, True, True, "jpeg")
     path = tmp_path / "made-00000.parquet"
     shards.write(path, [each], {})
     whole = path.read_bytes()

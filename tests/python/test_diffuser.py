@@ -19,15 +19,17 @@ from scipy.spatial.transform import Rotation
 
 import wiw
 from wiw.cli.app import main
-from wiw.datasets.demonstrations import Demonstration
+from wiw.datasets.demonstration import Demonstration, decode_colors, decode_depths
 from wiw.errors import ArgumentError, FileError, WeightsError
 from wiw.policies.base import Situation
 from wiw.policies.diffuser import paths
-from wiw.policies.diffuser.workspace import CELL, NOWHERE, WORKSPACE, PinholeCamera
+from wiw.policies.diffuser.workspace import CELL, NOWHERE, WORKSPACE, WRIST_SIZE, PinholeCamera
+from wiw.studies.run_log import load_run
+from wiw.tabletop.cloud import unproject_depth
 from wiw.tabletop.tasks import TABLETOP_TASKS
 from wiw.tabletop.workbench import CAMERAS, TABLE
 from wiw.training.recording import Collection, record_demonstration
-from wiw.types import ArmObservation, Goal, Key
+from wiw.types import ArmObservation, CameraView, Goal, Key
 
 torch = pytest.importorskip("torch", reason="needs wiw[torch]")
 
@@ -43,6 +45,7 @@ pytestmark = pytest.mark.usefixtures("one_torch_thread")
 
 SMALL = Shape(width=24, heads=2, layers=2)
 LENS = PinholeCamera.from_camera(CAMERAS["front"], (480, 480))
+WRIST_INTRINSICS = PinholeCamera.from_camera(CAMERAS["wrist"], (480, 480)).intrinsics
 HERE = np.array([0.0, 0.05, 1.2, np.pi, 0.0, 0.1, 1.0])
 
 
@@ -50,23 +53,31 @@ HERE = np.array([0.0, 0.05, 1.2, np.pi, 0.0, 0.1, 1.0])
 def shown() -> list[Demonstration]:
     """A block slid, and a ring put on a peg."""
     return [
-        record_demonstration(TABLETOP_TASKS[name], 3, Collection(frames=16, depth=True))[0]
+        record_demonstration(TABLETOP_TASKS[name], 3, Collection(frames=16, depth=True, wrist=True))[0]
         for name in ("slide_block", "insert_peg")
     ]
 
 
 @pytest.fixture(scope="module")
 def seen(shown: list[Demonstration]) -> Samples:
-    return extract_samples(shown, LENS)
+    return extract_samples(shown, LENS, WRIST_INTRINSICS)
 
 
-def make_untrained(seed: int = 0) -> Diffuser:
+def make_untrained(seed: int = 0, wrist: bool = False) -> Diffuser:
     torch.manual_seed(seed)
-    return Diffuser.from_network(Network(SMALL), steps=4)
+    return Diffuser.from_network(Network(replace(SMALL, wrist=wrist)), steps=4)
+
+
+def view_from_wrist(each: Demonstration, frame: int = 0) -> CameraView:
+    assert each.encoded_wrist_images is not None and each.encoded_wrist_depths is not None
+    assert each.wrist_poses is not None
+    image, depth = decode_colors(each.encoded_wrist_images)[frame], decode_depths(each.encoded_wrist_depths)[frame]
+    return CameraView(image, each.wrist_poses[frame], depth)
 
 
 def situation(each: Demonstration, key: Key, imagines: bool = True) -> Situation:
-    observation = ArmObservation(each.images[0], each.poses[0], each.depths[0])  # type: ignore[index]
+    assert each.depths is not None
+    observation = ArmObservation(each.images[0], each.poses[0], each.depths[0], wrist=view_from_wrist(each))
     return Situation(observation, Goal("manipulation", text=each.instruction), key, None, imagines=imagines)
 
 
@@ -112,6 +123,31 @@ def test_the_window_shows_the_whole_workspace_and_knows_where_it_is() -> None:
     away[2, 3] = 0.5
     with pytest.raises(ArgumentError, match="not in view"):
         PinholeCamera(LENS.intrinsics, away).find_window((480, 480))
+
+
+def test_the_wrist_camera_sees_things_where_the_front_camera_does(shown: list[Demonstration]) -> None:
+    """Pixels of the table's things by the hand's camera, reduced, lie among those of the front view."""
+    for each in shown:
+        frame = len(each) // 2
+        wrist, lens = view_from_wrist(each, frame), CAMERAS["wrist"]
+        camera = PinholeCamera.from_camera(lens, (480, 480), wrist.T_world_camera)
+        assert wrist.depth is not None and each.depths is not None
+        view = camera.view_from_wrist(wrist.image, wrist.depth)
+        assert view.image.shape == (WRIST_SIZE, WRIST_SIZE, 3) and view.places.shape == (15, 15, 3)
+        factor = 480 // WRIST_SIZE
+        middle = factor * (CELL // 2) + factor // 2  # of the first cell: the pixel that its depth is of
+        points = unproject_depth(wrist.depth, lens.hfov_deg, wrist.T_world_camera)[middle :: factor * CELL]
+        inside = view.places[..., 2] > 0
+        assert inside.sum() > 30
+        np.testing.assert_allclose(
+            view.places[inside], points[:, middle :: factor * CELL][inside], atol=0.004 * float(wrist.depth.max())
+        )
+        low = view.places[inside & (view.places[..., 2] < TABLE + 0.005)]
+        front = LENS.unproject(each.depths[frame])
+        near = np.linalg.norm(front[front[..., 2] > 0][None] - low[:20, None], axis=-1).min(axis=1)
+        assert np.median(near) < 0.006
+    with pytest.raises(ArgumentError, match="multiple of 120, got 100x100"):
+        camera.view_from_wrist(np.zeros((100, 100, 3), np.uint8), np.ones((100, 100), np.float32))
 
 
 # -- attention ---------------------------------------------------------------------------------------------------------
@@ -273,6 +309,21 @@ def test_candidates_differ_and_are_functions_of_the_key(shown: list[Demonstratio
     assert all(1 <= len(plan.actions) <= 4 for plan in policy.propose([first], 5, 4)[0])
 
 
+def test_what_the_wrist_camera_sees_counts_where_the_network_knows_it(shown: list[Demonstration]) -> None:
+    policy, key = make_untrained(wrist=True), Key(3, 1, 2)
+    assert policy.needs == ("depth", "wrist") and make_untrained().needs == ("depth",)
+    here = situation(shown[1], key)
+    dark = CameraView(
+        np.zeros((480, 480, 3), np.uint8), here.observation.wrist.T_world_camera, here.observation.wrist.depth
+    )
+    other = replace(here, observation=replace(here.observation, wrist=dark))
+    (seen,), (unseen,) = (policy.propose([each], 1, 50)[0] for each in (here, other))
+    assert not np.allclose(seen.actions, unseen.actions)
+    blind = make_untrained()
+    (seen,), (unseen,) = (blind.propose([each], 1, 50)[0] for each in (here, other))
+    np.testing.assert_array_equal(seen.actions, unseen.actions)
+
+
 def test_weights_are_kept_with_their_shape(tmp_path: Path, shown: list[Demonstration]) -> None:
     policy = make_untrained()
     policy._network.half().float()
@@ -309,13 +360,15 @@ def test_moments_are_the_beginnings_of_parts(shown: list[Demonstration], seen: S
     np.testing.assert_allclose(seen.path[0][[0, 1, 2, 3, 5], :6], plan[[0, 1, 2, 3, 3], :6], atol=1e-6)
     np.testing.assert_array_equal(seen.pose[0], shown[0].poses[0])
     rows, columns = LENS.find_window((480, 480))
-    np.testing.assert_array_equal(seen.view.image[0], shown[0].images[0][rows, columns])
+    np.testing.assert_array_equal(seen.views[0].image[0], shown[0].images[0][rows, columns])
     pushes, _ = record_demonstration(TABLETOP_TASKS["push_buttons"], 1, Collection(frames=16, depth=True))
     two = extract_samples([pushes], LENS)
-    assert len(two) == 2
+    assert len(two) == 2 and len(two.views) == 1 and len(seen.views) == 2
+    with pytest.raises(ArgumentError, match="wrist camera in all demonstrations"):
+        extract_samples([pushes], LENS, WRIST_INTRINSICS)
     np.testing.assert_allclose(two.path[:, 2:, :2], two.path[:, 1:2, :2].repeat(4, axis=1), atol=1e-9)
     np.testing.assert_allclose(two.path[:, 2, 2], two.path[:, 0, 2], atol=1e-9)  # up again, after the last push too
-    lit = two.view.image[1].astype(int) - two.view.image[0]
+    lit = two.views[0].image[1].astype(int) - two.views[0].image[0]
     assert np.abs(lit).max() > 60
     with pytest.raises(ArgumentError, match="--depth"):
         extract_samples([replace(shown[0], encoded_depths=None)], LENS)
@@ -438,9 +491,14 @@ def test_the_command_wants_views_as_it_will_see_them(tmp_path: Path, capsys: pyt
 def test_the_command_trains_on_what_was_collected(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     pytest.importorskip("pyarrow", reason="needs wiw[export]")
     demos, out = str(tmp_path / "demos"), tmp_path / "weights.safetensors"
-    few = ["--tasks", "slide_block", "--episodes", "3", "--frames", "16", "--depth"]
+    few = ["--tasks", "slide_block", "--episodes", "3", "--frames", "16", "--depth", "--wrist"]
     assert main(["collect", "manipulation", *few, "--out", demos]) == 0
     assert main(["train", "diffuser", "--demonstrations", demos, "--epochs", "2", "--out", str(out)]) == 0
     assert "3 demonstrations" in capsys.readouterr().out
     assert [each.name for each in tmp_path.iterdir() if each.name.startswith("weights")] == [out.name]
     assert load(out)[1]["recipe"]["epochs"] == 2
+    run = ["run", "manipulation", "--policy", "diffuser", "--policy-option", f"weights={out}", "--tasks", "slide_block"]
+    short = ["--episodes", "1", "--task-option", "actions=2", "--horizon", "2", "--task-option", "episodes=1"]
+    assert main([*run, *short, "--no-report", "--out", str(tmp_path / "run")]) == 0
+    log = load_run(tmp_path / "run")
+    assert [row["status"] for row in log.episodes] == ["done"] and len(log.decisions) == 1

@@ -24,7 +24,7 @@ import wiw
 from wiw.action import NULL, to_trajectory
 from wiw.cli import main
 from wiw.datasets import shards
-from wiw.datasets.demonstration import Demonstration
+from wiw.datasets.demonstration import Demonstration, decode_colors, decode_depths
 from wiw.datasets.demonstrations import Demonstrations, encode_depth, encode_image
 from wiw.datasets.lerobot import export_lerobot, import_lerobot, writing
 from wiw.datasets.lerobot.layout import color_feature
@@ -63,7 +63,7 @@ def views(tmp_path_factory: pytest.TempPathFactory, two_rooms: str) -> Path:
 def manipulation(tmp_path_factory: pytest.TempPathFactory) -> Path:
     folder = tmp_path_factory.mktemp("demos")
     tasks = ("slide_block", "push_buttons")
-    wiw.collect(folder, tasks, episodes=2, size=32, frames=16, seed=5, depth=True, backend="cpu")
+    wiw.collect(folder, tasks, episodes=2, size=32, frames=16, seed=5, depth=True, wrist=True, backend="cpu")
     return folder
 
 
@@ -174,6 +174,12 @@ def test_frames_of_manipulation_are_those_of_its_demonstrations(exported: Path, 
         pictures = [np.asarray(Image.open(io.BytesIO(data))) for data in each.encoded_images]
         np.testing.assert_array_equal(frames[FRONT][part], pictures)
         np.testing.assert_array_equal(frames[FRONT + "_depth"][part], each.depths)
+        wrist = "observation.images.wrist"
+        assert each.encoded_wrist_images is not None and each.encoded_wrist_depths is not None
+        np.testing.assert_array_equal(frames[wrist][part], decode_colors(each.encoded_wrist_images))
+        np.testing.assert_array_equal(frames[f"{wrist}_depth"][part], decode_depths(each.encoded_wrist_depths))
+        assert each.wrist_poses is not None
+        np.testing.assert_array_equal(frames["wrist_camera_pose"][part], each.wrist_poses.reshape(-1, 16))
         assert row["tasks"] == [each.instruction] and (row["kind"], row["seed"]) == (each.task, each.seed)
     rate = len(demonstrations) * 15 / sum(each.seconds[-1] for each in demonstrations)
     assert abs(wiw.datasets.lerobot.manipulation.estimate_rate(demonstrations) - rate) <= 0.5

@@ -3,7 +3,7 @@
 
 from __future__ import annotations
 
-from typing import Any
+from typing import Any, ClassVar
 
 import numpy as np
 import pytest
@@ -22,6 +22,7 @@ from wiw.errors import ArgumentError
 from wiw.tabletop.base import make_action
 from wiw.tabletop.cloud import unproject_depth
 from wiw.tabletop.workbench import CAMERAS, TABLE
+from wiw.types import GRIPPER_POSES, Key, Proposal
 
 ALL: dict[str, Any] = {
     "depth": True, "size": 60, "cameras": ("wrist", "left_shoulder", "right_shoulder"), "ids": True, "cloud": True,
@@ -51,6 +52,30 @@ def test_every_camera_gives_what_is_asked_for() -> None:
         assert len({observation[names[2]].tobytes(), *(observation[other].tobytes() for other in CAMERAS)}) == 5
     assert made(size=448).reset()[0]["front"].shape == (448, 448, 3)
     assert {*made().reset()[0]} == {"front", "pose", "joints", "held"}
+
+
+def test_policies_that_need_the_wrist_camera_are_given_it() -> None:
+    class ByWrist(wiw.Policy):
+        space, needs = GRIPPER_POSES, ("depth", "wrist")
+        seen: ClassVar[list[Any]] = []
+
+        def propose(self, situations: Any, candidates: int, horizon: int) -> Any:
+            self.seen += [each.observation for each in situations]
+            return [[Proposal(np.array([POSE]))] for _ in situations]
+
+    agent = wiw.Agent(ByWrist())
+    log = wiw.evaluate("manipulation", agent, 1, tasks="stack_cups", actions=2, progress=False)
+    assert [row["error"] for row in log.episodes] == [""] and len(ByWrist.seen) == 2
+    first, bench = ByWrist.seen[0], made(size=480).unwrapped
+    bench.begin(bench.task.episode(0))
+    np.testing.assert_array_equal(first.wrist.T_world_camera, bench.table.bench.get_camera_pose("wrist"))
+    alone = bench.table.bench.render_view("wrist", (480, 480), ("color", "depth"))
+    np.testing.assert_array_equal(first.wrist.image, alone["color"])
+    np.testing.assert_array_equal(first.as_dict()["wrist_depth"], alone["depth"])
+    blind = made(depth=True)
+    blind.reset(options={"episode": 0})
+    with pytest.raises(ArgumentError, match=r"cameras=\('wrist',\)"):
+        agent.decide(blind.observation, blind.goal, Key(0, 0))
 
 
 def test_ids_number_the_objects() -> None:

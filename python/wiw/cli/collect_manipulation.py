@@ -25,6 +25,7 @@ def collect_manipulation(
     frames: Annotated[int, arg(metavar="N")] = 150,
     format: Literal["jpeg", "png"] = "jpeg",
     depth: bool = False,
+    wrist: bool = False,
     keep_failed: bool = False,
     backend: Literal["auto", "cpu", "gpu"] = "auto",
     workers: Annotated[int, arg(metavar="N")] = 1,
@@ -49,6 +50,7 @@ def collect_manipulation(
         frames: Frames per demonstration, evenly spaced in time.
         format: Image format: jpeg of quality 95, or lossless png.
         depth: Whether to write the front view's depth too.
+        wrist: Whether to write what the wrist camera sees too, with --depth its depth as well.
         keep_failed: Whether to keep failed demonstrations, too; otherwise another table replaces theirs.
         backend: Renderer; pictures differ a little between them.
         workers: Processes; the files are the same for any number of them.
@@ -58,7 +60,7 @@ def collect_manipulation(
 
     began = time.monotonic()
     what_of_it = {"episodes": episodes, "seed": seed, "keep_failed": keep_failed}
-    how_seen = {"size": size, "frames": frames, "format": format, "depth": depth, "backend": backend}
+    how_seen = {"size": size, "frames": frames, "format": format, "depth": depth, "wrist": wrist, "backend": backend}
     with announce_resume(), Bars() as bars:
         made = collect(
             out, tasks, workers=workers, place=place, progress=partial(_show, bars), **what_of_it, **how_seen

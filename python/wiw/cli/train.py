@@ -456,7 +456,9 @@ def _train_diffuser(
             f"{collection.config.get('size')}; collect with --size {Sensors.size}"
         )
     camera = PinholeCamera(collection.camera.intrinsics, collection.camera.T_world_camera)
-    samples = training.extract_samples(_show_bar(collection, "reading", len(collection)), camera)
+    samples = training.extract_samples(
+        _show_bar(collection, "reading", len(collection)), camera, collection.wrist_intrinsics
+    )
     card: dict[str, Any] = {"demonstrations": collection.config, "moments": len(samples)}
     identity = {**card, "recipe": asdict(recipe), "minutes": minutes}
     checkpoint = Checkpoint(out.with_name(f"{out.name}.checkpoint"), identity)

@@ -59,6 +59,12 @@ class Demonstration:
     """T front views, JPEG or PNG."""
     encoded_depths: tuple[bytes, ...] | None = None
     """T depths of the front view, 16-bit PNG."""
+    encoded_wrist_images: tuple[bytes, ...] | None = None
+    """T views of the wrist camera, JPEG or PNG; None where none were collected."""
+    encoded_wrist_depths: tuple[bytes, ...] | None = None
+    """T depths of the wrist camera's view, 16-bit PNG."""
+    wrist_poses: NDArray[np.float64] | None = None
+    """float64 [T, 4, 4]: T_world_camera of the wrist camera."""
 
     def __len__(self) -> int:
         return len(self.seconds)
@@ -78,7 +84,7 @@ class Demonstration:
         Raises:
             FileError: one of them is damaged.
         """
-        return decode_pictures([self.encoded_images[frame] for frame in frames], cv2.IMREAD_COLOR)[..., ::-1]
+        return decode_colors([self.encoded_images[frame] for frame in frames])
 
     @cached_property
     def depths(self) -> NDArray[np.float32] | None:
@@ -87,10 +93,25 @@ class Demonstration:
         Raises:
             FileError: one of them is damaged.
         """
-        if self.encoded_depths is None:
-            return None
-        units = decode_pictures(self.encoded_depths, cv2.IMREAD_UNCHANGED)
-        return units.astype(np.float32) / np.float32(DEPTH_UNITS)
+        return None if self.encoded_depths is None else decode_depths(self.encoded_depths)
+
+
+def decode_colors(pictures: Sequence[bytes]) -> NDArray[np.uint8]:
+    """Return pictures in colour, uint8 [T, H, W, 3].
+
+    Raises:
+        FileError: one of them is damaged, or of another size than the others.
+    """
+    return decode_pictures(pictures, cv2.IMREAD_COLOR)[..., ::-1]
+
+
+def decode_depths(pictures: Sequence[bytes]) -> NDArray[np.float32]:
+    """Return planar depths in metres, float32 [T, H, W].
+
+    Raises:
+        FileError: one of them is damaged, or of another size than the others.
+    """
+    return decode_pictures(pictures, cv2.IMREAD_UNCHANGED).astype(np.float32) / np.float32(DEPTH_UNITS)
 
 
 def decode_pictures(pictures: Sequence[bytes], how: int) -> NDArray[Any]:

@@ -125,6 +125,18 @@ class Demonstrations(Sequence[Demonstration]):
         facts = self.files[0].facts["camera"]
         return FrontCamera(np.array(facts["intrinsics"]), np.array(facts["T_world_camera"]))
 
+    @property
+    def wrist_intrinsics(self) -> NDArray[np.float64] | None:
+        """Intrinsics float64 [3, 3] of the wrist camera, as in `FrontCamera`; None where its views were not collected.
+
+        Raises:
+            FileError: nothing has been collected yet.
+        """
+        if not self.files:
+            raise FileError(f"{self.folder}: nothing has been collected yet")
+        facts = self.files[0].facts.get("wrist_camera")
+        return None if facts is None else np.array(facts["intrinsics"])
+
     def _resolve_tasks(self, tasks: str | Sequence[str]) -> list[str]:
         known = self.config["tasks"]
         names = known if tasks == "all" else tasks.split(",") if isinstance(tasks, str) else list(tasks)

@@ -31,7 +31,11 @@ COLUMNS: Mapping[str, str] = {
     "places": "JSON: T_world_object [4, 4] in frame 0 of all that agents are told the place of, by name",
     "image": "the front view, sRGB, JPEG or PNG",
     "depth": "the front view's planar depth, 16-bit PNG, 5000 a metre, 0 where nothing is hit",
+    "wrist": "the wrist camera's view, sRGB, JPEG or PNG",
+    "wrist_depth": "its planar depth, as that of the front view",
+    "wrist_pose": "T_world_camera of the wrist camera, 4 x 4 row by row; it looks along -z with +y up",
 }
+PICTURES = ("image", "depth", "wrist", "wrist_depth")
 REPEATED = ("task", "instruction", "places")
 """Text that is the same all through a demonstration, which Parquet then writes once."""
 
@@ -56,10 +60,9 @@ def write(path: Path, demonstrations: Sequence[Demonstration], facts: Mapping[st
     Raises:
         FileError: it cannot be written, for instance because the disk is full.
     """
-    depth = demonstrations[0].encoded_depths is not None
-    schema = _schema(depth, facts)
-    tables = (_table(each, schema) for each in demonstrations)
-    write_row_groups(path, schema, tables, use_dictionary=list(REPEATED), compression=_packing(depth))
+    schema = _build_schema(_list_columns(demonstrations[0]), facts)
+    tables = (_build_table(each, schema) for each in demonstrations)
+    write_row_groups(path, schema, tables, use_dictionary=list(REPEATED), compression=_choose_compression(schema.names))
 
 
 class Shard(RowGroupFile):
@@ -80,7 +83,7 @@ class Shard(RowGroupFile):
         """
         rows = self.read(index).to_pydict()
         try:
-            return _demonstration(rows)
+            return _build_demonstration(rows)
         except (LookupError, TypeError, ValueError) as error:
             raise self.build_damage_error(error) from error
 
@@ -97,7 +100,18 @@ class Shard(RowGroupFile):
             raise self.build_damage_error(error) from error
 
 
-def _schema(depth: bool, facts: Mapping[str, Any]) -> Any:
+def _list_columns(demonstration: Demonstration) -> list[str]:
+    """Return the columns of a file with such demonstrations."""
+    absent = {
+        "depth": demonstration.encoded_depths is None,
+        "wrist": demonstration.encoded_wrist_images is None,
+        "wrist_depth": demonstration.encoded_wrist_depths is None,
+        "wrist_pose": demonstration.wrist_poses is None,
+    }
+    return [name for name in COLUMNS if not absent.get(name)]
+
+
+def _build_schema(columns: Sequence[str], facts: Mapping[str, Any]) -> Any:
     import pyarrow as pa
 
     picture = image_type()
@@ -118,21 +132,23 @@ def _schema(depth: bool, facts: Mapping[str, Any]) -> Any:
         "places": pa.string(),
         "image": picture,
         "depth": picture,
+        "wrist": picture,
+        "wrist_depth": picture,
+        "wrist_pose": pa.list_(pa.float64(), 16),
     }
-    if not depth:
-        del types["depth"]
-    return build_schema(types, {"format": FORMAT, **facts, "columns": {name: COLUMNS[name] for name in types}})
+    about = {name: COLUMNS[name] for name in columns}
+    return build_schema({name: types[name] for name in columns}, {"format": FORMAT, **facts, "columns": about})
 
 
-def _packing(depth: bool) -> dict[str, str]:
-    """Pictures are packed already."""
-    numbers = [name for name in COLUMNS if name not in ("image", "depth", "pose", "action")]
-    packed = dict.fromkeys((*numbers, "pose.list.element", "action.list.element"), "zstd")
-    pictures = ("image", "depth") if depth else ("image",)
-    return packed | {f"{name}.{part}": "none" for name in pictures for part in ("bytes", "path")}
+def _choose_compression(columns: Sequence[str]) -> dict[str, str]:
+    """Return the compression of each column; pictures are compressed already."""
+    pictures = [f"{name}.{part}" for name in columns if name in PICTURES for part in ("bytes", "path")]
+    lists = ("pose", "action", "wrist_pose")
+    numbers = [f"{name}.list.element" if name in lists else name for name in columns if name not in PICTURES]
+    return {**dict.fromkeys(numbers, "zstd"), **dict.fromkeys(pictures, "none")}
 
 
-def _table(demonstration: Demonstration, schema: Any) -> Any:
+def _build_table(demonstration: Demonstration, schema: Any) -> Any:
     import pyarrow as pa
 
     each, count = demonstration, len(demonstration)
@@ -152,13 +168,23 @@ def _table(demonstration: Demonstration, schema: Any) -> Any:
         "places": [json.dumps({name: pose.tolist() for name, pose in each.places.items()})] * count,
         "image": image_values(each.encoded_images),
     }
-    if each.encoded_depths is not None:
-        columns["depth"] = image_values(each.encoded_depths)
+    for name, encoded in (
+        ("depth", each.encoded_depths),
+        ("wrist", each.encoded_wrist_images),
+        ("wrist_depth", each.encoded_wrist_depths),
+    ):
+        if encoded is not None:
+            columns[name] = image_values(encoded)
+    if each.wrist_poses is not None:
+        columns["wrist_pose"] = list(each.wrist_poses.reshape(count, 16))
     return pa.table([pa.array(columns[name], schema.field(name).type) for name in schema.names], schema=schema)
 
 
-def _demonstration(rows: Mapping[str, list[Any]]) -> Demonstration:
-    depths = rows.get("depth")
+def _build_demonstration(rows: Mapping[str, list[Any]]) -> Demonstration:
+    def read_pictures(name: str) -> tuple[bytes, ...] | None:
+        return None if name not in rows else tuple(picture["bytes"] for picture in rows[name])
+
+    poses = rows.get("wrist_pose")
     return Demonstration(
         task=rows["task"][0],
         variation=rows["variation"][0],
@@ -173,5 +199,8 @@ def _demonstration(rows: Mapping[str, list[Any]]) -> Demonstration:
         keys=np.array(rows["key"], np.int32),
         ended=np.array(rows["ended"], np.bool_),
         encoded_images=tuple(picture["bytes"] for picture in rows["image"]),
-        encoded_depths=None if depths is None else tuple(picture["bytes"] for picture in depths),
+        encoded_depths=read_pictures("depth"),
+        encoded_wrist_images=read_pictures("wrist"),
+        encoded_wrist_depths=read_pictures("wrist_depth"),
+        wrist_poses=None if poses is None else np.array(poses, np.float64).reshape(-1, 4, 4),
     )

@@ -19,8 +19,8 @@ from wiw.envs.sensors import Sensors
 from wiw.envs.table_guide import TableGuide
 from wiw.errors import ArgumentError
 from wiw.tabletop.table import Table
-from wiw.tabletop.workbench import Pose, Workbench
-from wiw.types import Answer, ArmObservation, Episode, Goal, Key, TextAnswer, Truth
+from wiw.tabletop.workbench import WRIST, Pose, Workbench
+from wiw.types import Answer, ArmObservation, CameraView, Episode, Goal, Key, TextAnswer, Truth
 
 LEAST, MOST = np.array([-2.0] * 3 + [-7.0] * 3 + [0.0]), np.array([2.0] * 3 + [7.0] * 3 + [1.0])
 """Poses between these are in the action space; none beyond can be reached."""
@@ -71,7 +71,7 @@ class ManipulationEnv(gymnasium.Env[dict[str, Any], NDArray[np.float64]], Env):
         self.observation_space = observation_space(self.sensors)
         self._table: Table | None = None
         self._observation: ArmObservation | None = None
-        self._front: dict[str, NDArray[Any]] = {}
+        self._drawn: dict[str, dict[str, NDArray[Any]]] = {}
         self._taken = self._decisions = self._next = 0
         self._refused: list[str] = []
         self._key = Key(task.seed, 0)
@@ -192,15 +192,24 @@ class ManipulationEnv(gymnasium.Env[dict[str, Any], NDArray[np.float64]], Env):
 
     def _observe(self) -> ArmObservation:
         bench = self.table.bench
-        self._front = self.sensors.pictures(bench)
-        depth = self._front["depth"] if self.sensors.depth else None
+        seen = [name for name in ("front", WRIST) if name in self.sensors.names]
+        self._drawn = {name: self.sensors.pictures(bench, name) for name in seen}
+        front = self._drawn["front"]
         places: dict[str, Pose] = bench.get_poses(self.table.objects)
-        self._observation = ArmObservation(self._front["color"], bench.pose, depth, places)
+        depth = front["depth"] if self.sensors.depth else None
+        self._observation = ArmObservation(front["color"], bench.pose, depth, places, self._view_from_wrist())
         return self._observation
+
+    def _view_from_wrist(self) -> CameraView | None:
+        if WRIST not in self._drawn:
+            return None
+        drawn = self._drawn[WRIST]
+        depth = drawn["depth"] if self.sensors.depth else None
+        return CameraView(drawn["color"], self.table.bench.get_camera_pose(WRIST), depth)
 
     def _read_sensors(self) -> dict[str, Any]:
         """The observation as gymnasium knows it, with what the loop has no use for."""
-        return self.sensors.read(self.table.bench, self.table.objects, self._front)
+        return self.sensors.read(self.table.bench, self.table.objects, self._drawn)
 
     def _require_episode(self) -> None:
         if self._table is None:

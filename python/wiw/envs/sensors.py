@@ -3,8 +3,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from types import MappingProxyType
 from typing import Any
 
 import numpy as np
@@ -16,6 +17,7 @@ from wiw.render import Output
 from wiw.tabletop.cloud import unproject_depth
 from wiw.tabletop.workbench import CAMERAS, Workbench
 
+NOTHING: Mapping[str, Any] = MappingProxyType({})
 ROOM, ARM = 0, 255
 """Ids of what is no object; those are numbered from 1."""
 
@@ -80,18 +82,16 @@ class Sensors:
         return bench.render_view(camera, (self.size, self.size), self.outputs)
 
     def read(
-        self, bench: Workbench, objects: Sequence[str], front: dict[str, NDArray[Any]] | None = None
+        self, bench: Workbench, objects: Sequence[str], drawn: Mapping[str, dict[str, NDArray[Any]]] = NOTHING
     ) -> dict[str, Any]:
         """Return an observation in `space`.
 
         Args:
             bench: what is looked at.
             objects: names of what has an id of its own, from 1 on.
-            front: the front camera's `pictures`, where they are drawn already.
+            drawn: `pictures` of cameras that are drawn already.
         """
-        drawn = {name: self.pictures(bench, name) for name in self.names if front is None or name != "front"}
-        if front is not None:
-            drawn = {"front": front, **drawn}
+        drawn = {name: drawn[name] if name in drawn else self.pictures(bench, name) for name in self.names}
         values: dict[str, Any] = {
             "pose": bench.pose,
             "joints": bench.joints,

@@ -23,12 +23,17 @@ class PlanChecker(Protocol):
         """See `wiw.loop.plan_space.PlanSpace.check_plan`."""
 
 
-def check_depth(needs: Collection[str], observations: Sequence[Any]) -> None:
-    """Check that observations have depth where an agent with these `needs` reads it.
+def check_observations(needs: Collection[str], observations: Sequence[Any]) -> None:
+    """Check that observations have the depth and the wrist camera's view where an agent with these `needs` reads them.
 
     Raises:
-        ArgumentError: an observation has none.
+        ArgumentError: an observation lacks one of them.
     """
+    if "wrist" in needs and any(getattr(observation, "wrist", None) is None for observation in observations):
+        raise ArgumentError(
+            "this agent needs the view of the wrist camera, and got an observation without: make the environment of "
+            "manipulation with cameras=('wrist',)"
+        )
     if "depth" in needs and any(observation.depth is None for observation in observations):
         raise ArgumentError(
             "this agent needs observations with depth, and got one without: make the environment with depth=True"

@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from wiw.loop.config import AgentConfig
-from wiw.loop.contract import check_answers, check_depth, check_pictures, check_proposals, check_scores
+from wiw.loop.contract import check_answers, check_observations, check_pictures, check_proposals, check_scores
 from wiw.loop.imagination import Imagination, Imaginer, ModelInput, NoImagination, Request
 from wiw.loop.ledger import Ledger
 from wiw.loop.memory import EpisodeMemories, Query
@@ -90,7 +90,7 @@ class DecisionPass:
 
     def __init__(self, parts: AgentParts, queries: Sequence[Query]) -> None:
         self._parts, self._queries = parts, queries
-        check_depth(parts.needs, [query.observation for query in queries])
+        check_observations(parts.needs, [query.observation for query in queries])
         self._ledger = Ledger(parts.count_spent, len(queries))
         self._proposing, self._revising = parts.memories.recall(queries, parts.imaginer)
         with self._ledger.clock("platform"):

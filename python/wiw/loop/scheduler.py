@@ -69,6 +69,12 @@ class LiveEpisode:
         return record
 
 
+def _open_environment(task: Any, needs: Collection[str]) -> Any:
+    """Return an environment whose observations have what an agent needs."""
+    cameras = {"cameras": ("wrist",)} if "wrist" in needs else {}
+    return task.environment(depth="depth" in needs, **cameras)
+
+
 def run_episodes(
     task: Any,
     agent: Agent,
@@ -91,7 +97,7 @@ def run_episodes(
     raised; so is what the sink raises.
     """
     waiting, running, suspects = deque(episodes), list[LiveEpisode](), deque[tuple[int, Episode]]()
-    envs = [task.environment(depth="depth" in agent.needs) for _ in range(min(live, len(episodes)))]
+    envs = [_open_environment(task, agent.needs) for _ in range(min(live, len(episodes)))]
     environments, keys = LiveEnvironments(), {index: make_key(seed, index, salt) for index, _ in episodes}
     agent.grant(environments)
     try:

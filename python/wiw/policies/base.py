@@ -61,7 +61,7 @@ class Policy(ABC):
     space: str = PRIMITIVES
     """Kind of actions that its plans are made of: a name of `wiw.loop.plan_space`."""
     needs: tuple[str, ...] = ()
-    """"depth" where observations must carry it."""
+    """"depth" where observations must carry it, "wrist" where they must have the view of an arm's wrist camera."""
     frames: FrameSpec = FrameSpec()
     default_revision: str | None = None
     """Name of the reviser to use where this policy only proposes."""

@@ -219,14 +219,20 @@ def _draw_diffuser(network: Any, batch: int) -> Inputs:
     return *scene, torch.randn(batch, PATHS, network.shape.poses, 9), torch.randint(0, 100, (batch, PATHS))
 
 
+def _encode_scene(network: Any, image: Tensor, height: Tensor, places: Tensor, now: Tensor) -> Any:
+    from wiw.policies.diffuser.network import Views
+
+    return network.encode_scene([Views(image, height, places)], now)
+
+
 def _denoise(network: Any, *inputs: Any) -> Any:
     *scene, noised, level = inputs
-    return network.denoise(network.encode_scene(*scene), noised, level)
+    return network.denoise(_encode_scene(network, *scene), noised, level)
 
 
 def _sample_diffuser(network: Any, *inputs: Any) -> Any:
     *scene, noised, level = inputs
-    encoded = network.encode_scene(*scene)
+    encoded = _encode_scene(network, *scene)
     for _ in range(STEPS):
         noised, _ = network.denoise(encoded, noised, level)
     return noised

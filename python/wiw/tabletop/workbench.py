@@ -100,11 +100,13 @@ class Camera:
         return np.array([width / 2, height / 2]) + focal * seen[:, :2] * (1, -1) / -seen[:, 2:]
 
 
+WRIST = "wrist"
+"""Name of the camera on the hand."""
 CAMERAS: Mapping[str, Camera] = {
     "front": Camera((1.0, 0.0, 1.4), (0.0, 0.0, 0.96)),
     "left_shoulder": Camera((-0.45, 0.75, 1.6), (0.2, 0.0, 0.8)),
     "right_shoulder": Camera((-0.45, -0.75, 1.6), (0.2, 0.0, 0.8)),
-    "wrist": Camera((0.07, 0.0, 0.02), (0.02, 0.0, 0.3), 80.0, on_hand=True),
+    WRIST: Camera((0.07, 0.0, 0.02), (0.02, 0.0, 0.3), 80.0, on_hand=True),
 }
 
 

@@ -21,7 +21,7 @@ from wiw.errors import ArgumentError, FileError
 from wiw.ray_cluster import HERE, Engine
 from wiw.render import resolve_backend
 from wiw.tabletop.tasks import TABLETOP_TASKS
-from wiw.tabletop.workbench import CAMERAS
+from wiw.tabletop.workbench import CAMERAS, WRIST
 from wiw.training.jobs import open_folder, run_jobs
 from wiw.training.recording import Collection, record_demonstration
 
@@ -38,7 +38,7 @@ def collect(
     progress: Progress | None = None,
     **asked: Any,
 ) -> Demonstrations:
-    """Let experts perform manipulation tasks and record what the front camera sees; resume where it was interrupted.
+    """Let experts perform manipulation tasks and record what the cameras see; resume where it was interrupted.
 
     Args:
         out: a new folder, or one that the same call began.
@@ -46,7 +46,7 @@ def collect(
         workers: number of processes; the files do not depend on it.
         place: where they are: on this machine, or tasks on a Ray cluster whose machines all see the folder.
         progress: called whenever a file is complete.
-        **asked: episodes, seed, size, frames, format, depth, keep_failed, backend, as in
+        **asked: episodes, seed, size, frames, format, depth, wrist, keep_failed, backend, as in
             `wiw.training.recording.Collection`.
 
     Raises:
@@ -62,7 +62,10 @@ def collect(
     place.require_valid("collect")
     if workers < 1:
         raise ArgumentError(f"collect: expected 1 worker or more, got {workers}")
-    config = {"wiw": wiw.__version__, "tasks": names, **asdict(collection)}
+    settings = asdict(collection)
+    if not collection.wrist:
+        del settings["wrist"]  # the manifest of a folder that was begun without knowing of it stays equal
+    config = {"wiw": wiw.__version__, "tasks": names, **settings}
     open_folder(folder, config, read_manifest)
     paths = zip(*(shard_paths(folder, config, task) for task in names), strict=True)
     jobs = [  # in turn, so that what a stopped collection has is of all tasks alike
@@ -104,8 +107,10 @@ class _Job:
             "wiw": wiw.__version__,
             "task": self.task,
             "failed": failed,
-            "camera": _describe_camera(self.collection.size),
+            "camera": _describe_camera("front", self.collection.size),
         }
+        if self.collection.wrist:
+            facts["wrist_camera"] = _describe_camera(WRIST, self.collection.size)
         shards.write(self.path, [demonstration for demonstration, _ in made], facts)
         return failed
 
@@ -133,13 +138,15 @@ def _parse_tasks(tasks: str | Sequence[str]) -> list[str]:
     return names
 
 
-def _describe_camera(size: int) -> dict[str, Any]:
-    camera = CAMERAS["front"]
+def _describe_camera(name: str, size: int) -> dict[str, Any]:
+    """Return a camera's facts; where one on the hand is, each frame says."""
+    camera = CAMERAS[name]
     focal = size / 2 / np.tan(np.radians(camera.hfov_deg) / 2)
+    fixed = {} if camera.on_hand else {"T_world_camera": camera.pose.tolist()}
     return {
         "size": [size, size],
         "hfov_deg": camera.hfov_deg,
         "intrinsics": [[focal, 0, size / 2], [0, focal, size / 2], [0, 0, 1]],
-        "T_world_camera": camera.pose.tolist(),
+        **fixed,
         "axes": "looks along -z, +x right, +y up; world z up; metres; centres of pixels at + 0.5",
     }

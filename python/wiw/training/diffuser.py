@@ -3,9 +3,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Iterator, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from copy import deepcopy
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from functools import partial
 from typing import TYPE_CHECKING
 
@@ -17,9 +17,10 @@ from torch import Tensor
 from torch.nn import functional
 
 from wiw._core import core
+from wiw.datasets.demonstration import decode_colors, decode_depths
 from wiw.errors import ArgumentError
 from wiw.policies.diffuser.diffusion import ALPHA_BARS, NOISE_LEVELS, add_noise
-from wiw.policies.diffuser.network import Network, Shape
+from wiw.policies.diffuser.network import Network, Shape, Views, stack_views
 from wiw.policies.diffuser.paths import MIDDLE, to_vectors
 from wiw.policies.diffuser.workspace import PinholeCamera, WorkspaceView
 from wiw.training.checkpoint import Checkpoint, ResumableTrainer
@@ -36,8 +37,8 @@ SUBTASK_LENGTHS: Mapping[str, int] = {"push_buttons": 3, "slide_block": 4, "inse
 class Samples:
     """N training samples: what was seen, and the path that the expert took next."""
 
-    view: WorkspaceView
-    """The views of N frames."""
+    views: tuple[WorkspaceView, ...]
+    """Views of N frames by each camera: the front one, and that on the wrist where it was recorded."""
     pose: NDArray[np.float64]
     """float64 [N, 7]: the gripper's pose."""
     path: NDArray[np.float64]
@@ -75,32 +76,72 @@ class Recipe:
             raise ArgumentError(f"Recipe: epochs, batch, levels, width and layers must be positive, got {self}")
 
 
-def extract_samples(demonstrations: Iterable[Demonstration], camera: PinholeCamera) -> Samples:
-    """Return a training sample for each subtask of the demonstrations, as a camera sees its beginning.
+def extract_samples(
+    demonstrations: Iterable[Demonstration], camera: PinholeCamera, wrist_intrinsics: NDArray[np.float64] | None = None
+) -> Samples:
+    """Return a training sample for each subtask of the demonstrations, as cameras see its beginning.
+
+    Args:
+        demonstrations: with depth.
+        camera: the front one.
+        wrist_intrinsics: float64 [3, 3] of the wrist camera; its views are left out if not given.
 
     Raises:
-        ArgumentError: there are none, or some are of an unknown task or without depth.
+        ArgumentError: there are none, or some are of an unknown task, or without depth or the wrist camera's views.
     """
-    found = [each for demonstration in demonstrations for each in _split_into_subtasks(demonstration, camera)]
+    cameras = Cameras(camera, wrist_intrinsics)
+    found = [each for demonstration in demonstrations for each in _split_into_subtasks(demonstration, cameras)]
     if not found:
         raise ArgumentError("diffuser: expected demonstrations to learn from, got none")
     views, poses, paths = zip(*found, strict=True)
-    view = WorkspaceView(*(np.stack([getattr(each, name) for each in views]) for name in ("image", "height", "places")))
-    return Samples(view, np.stack(poses), np.stack(paths))
+    return Samples(tuple(_stack(each) for each in zip(*views, strict=True)), np.stack(poses), np.stack(paths))
+
+
+def _stack(views: Sequence[WorkspaceView]) -> WorkspaceView:
+    """Return N views by one camera as one."""
+    return WorkspaceView(*(np.stack([getattr(each, name) for each in views]) for name in ("image", "height", "places")))
+
+
+@dataclass(frozen=True)
+class Cameras:
+    """The cameras that demonstrations are looked at by."""
+
+    front: PinholeCamera
+    wrist_intrinsics: NDArray[np.float64] | None = None
+
+    def view(self, demonstration: Demonstration, frame: int) -> list[WorkspaceView]:
+        """Return what each camera sees of the workspace in a frame; no other frame is decoded.
+
+        Raises:
+            ArgumentError: the demonstration lacks depth or the wrist camera's views.
+        """
+        if demonstration.encoded_depths is None:
+            raise ArgumentError("diffuser: expected demonstrations with depth, of `wiw collect manipulation --depth`")
+        one = slice(frame, frame + 1)
+        image, depth = (
+            decode_colors(demonstration.encoded_images[one]),
+            decode_depths(demonstration.encoded_depths[one]),
+        )
+        views = [self.front.view_workspace(image[0], depth[0])]
+        if self.wrist_intrinsics is None:
+            return views
+        images, depths = demonstration.encoded_wrist_images, demonstration.encoded_wrist_depths
+        if images is None or depths is None or demonstration.wrist_poses is None:
+            raise ArgumentError("diffuser: expected views of the wrist camera in all demonstrations, got one without")
+        wrist = PinholeCamera(self.wrist_intrinsics, demonstration.wrist_poses[frame])
+        return [*views, wrist.view_from_wrist(decode_colors(images[one])[0], decode_depths(depths[one])[0])]
 
 
 def _split_into_subtasks(
-    demonstration: Demonstration, camera: PinholeCamera
-) -> Iterator[tuple[WorkspaceView, NDArray[np.float64], NDArray[np.float64]]]:
-    """Yield the view at the beginning of each subtask, the gripper's pose there, and the poses that it goes to.
+    demonstration: Demonstration, cameras: Cameras
+) -> Iterator[tuple[list[WorkspaceView], NDArray[np.float64], NDArray[np.float64]]]:
+    """Yield the views at the beginning of each subtask, the gripper's pose there, and the poses that it goes to.
 
     A demonstration ends with its success. Where that comes before the hand has withdrawn, a pose straight above is
     added.
     """
     if demonstration.task not in SUBTASK_LENGTHS:
         raise ArgumentError(f"diffuser: expected tasks among {', '.join(SUBTASK_LENGTHS)}, got {demonstration.task}")
-    if demonstration.encoded_depths is None:
-        raise ArgumentError("diffuser: expected demonstrations with depth, of `wiw collect manipulation --depth`")
     parts, keys, longest = SUBTASK_LENGTHS[demonstration.task], demonstration.keys, max(SUBTASK_LENGTHS.values())
     for first in range(0, int(keys.max()), parts):
         frame = int(np.flatnonzero(keys <= first)[-1])
@@ -110,16 +151,7 @@ def _split_into_subtasks(
             up = max(pose[2] for pose in poses)
             poses.append(np.concatenate([poses[-1][:2], [up], poses[-1][3:]]))
         path = np.stack(poses + [poses[-1]] * (longest - len(poses)))
-        yield camera.view_workspace(*_decode_frame(demonstration, frame)), demonstration.poses[frame], path
-
-
-def _decode_frame(demonstration: Demonstration, frame: int) -> tuple[NDArray[np.uint8], NDArray[np.float32]]:
-    """Decode image and depth of one frame, without decoding the others."""
-    assert demonstration.encoded_depths is not None
-    images, depths = demonstration.encoded_images[frame : frame + 1], demonstration.encoded_depths[frame : frame + 1]
-    alone = replace(demonstration, encoded_images=images, encoded_depths=depths)
-    assert alone.depths is not None
-    return alone.images[0], alone.depths[0]
+        yield cameras.view(demonstration, frame), demonstration.poses[frame], path
 
 
 def train(
@@ -154,7 +186,7 @@ class _Trainer(ResumableTrainer):
     def __init__(self, samples: Samples, recipe: Recipe) -> None:
         torch.manual_seed(core.fold_key([recipe.seed, 0xD1F1]) % 2**63)
         self.samples, self.recipe = samples, recipe
-        shape = Shape(recipe.width, layers=recipe.layers, poses=samples.path.shape[1])
+        shape = Shape(recipe.width, layers=recipe.layers, poses=samples.path.shape[1], wrist=len(samples.views) > 1)
         self.network = Network(shape)
         self.average = deepcopy(self.network)
         self.optimiser = torch.optim.AdamW(self.network.parameters(), recipe.rate, weight_decay=recipe.decay)
@@ -180,7 +212,7 @@ class _Trainer(ResumableTrainer):
         level = torch.randint(NOISE_LEVELS, count, generator=generator)
         clean = batch.path[:, None].expand(-1, recipe.levels, -1, -1)
         noise = torch.randn(*count, *clean.shape[2:-1], 9, generator=generator)
-        scene = network.encode_scene(batch.image, batch.height, batch.places, batch.now)
+        scene = network.encode_scene(batch.views, batch.now)
         found, gripper = network.denoise(scene, add_noise(clean[..., :9], noise, level), level)
         off = _compute_huber_errors(found - clean[..., :9], level)
         grip = functional.binary_cross_entropy_with_logits(gripper, clean[..., 9])
@@ -207,12 +239,8 @@ def _compute_huber_errors(off: Tensor, level: Tensor) -> Tensor:
 class Batch:
     """Samples as the network's input."""
 
-    image: Tensor
-    """uint8 [B, h, w, 3]."""
-    height: Tensor
-    """[B, h, w]."""
-    places: Tensor
-    """[B, h / CELL, w / CELL, 3]."""
+    views: list[Views]
+    """One of each camera."""
     now: Tensor
     """[B, 10]."""
     path: Tensor
@@ -225,18 +253,22 @@ def sample_batch(samples: Samples, count: int, tilt: float, rng: np.random.Gener
     """
     chosen = rng.integers(0, len(samples), count)
     light = rng.uniform(0.8, 1.2, (count, 1, 1, 1)) * rng.uniform(0.92, 1.08, (count, 1, 1, 3))
-    images = (samples.view.image[chosen] * light.astype(np.float32)).clip(0, 255).astype(np.uint8)
     angles = rng.uniform(-tilt, tilt, count)
     turns = Rotation.from_euler("z", angles[:, None]).as_matrix()
-    places = np.einsum("bij,bhwj->bhwi", turns, samples.view.places[chosen] - MIDDLE) + MIDDLE
     poses = np.concatenate([samples.pose[chosen, None], samples.path[chosen]], axis=1)
     poses[..., :3] = np.einsum("bij,blj->bli", turns, poses[..., :3] - MIDDLE) + MIDDLE
     poses[..., 5] += angles[:, None]
     vectors = torch.from_numpy(to_vectors(poses))
-    return Batch(
-        torch.from_numpy(images),
-        torch.from_numpy(samples.view.height[chosen]),
-        torch.from_numpy(places.astype(np.float32)),
-        vectors[:, 0],
-        vectors[:, 1:],
+    views = [_augment_view(each, chosen, light.astype(np.float32), turns) for each in samples.views]
+    return Batch(views, vectors[:, 0], vectors[:, 1:])
+
+
+def _augment_view(
+    view: WorkspaceView, chosen: NDArray[np.int64], light: NDArray[np.float32], turns: NDArray[np.float64]
+) -> Views:
+    """Return the chosen rows in another light [B, 1, 1, 3], rotated by matrices [B, 3, 3] about the middle."""
+    images = (view.image[chosen] * light).clip(0, 255).astype(np.uint8)
+    places = np.einsum("bij,bhwj->bhwi", turns, view.places[chosen] - MIDDLE) + MIDDLE
+    return stack_views(
+        [WorkspaceView(*each) for each in zip(images, view.height[chosen], places.astype(np.float32), strict=True)]
     )

@@ -15,7 +15,7 @@ from wiw.datasets.demonstrations import Demonstration, Format, encode_depth, enc
 from wiw.errors import ArgumentError, InfrastructureError
 from wiw.render import Output
 from wiw.tabletop.base import TableSetup, TabletopTask
-from wiw.tabletop.workbench import Film, Workbench
+from wiw.tabletop.workbench import WRIST, Film, Workbench
 
 Backend = Literal["auto", "cpu", "gpu"]
 POSES = 15
@@ -43,6 +43,8 @@ class Collection:
     """Frames of each demonstration."""
     format: Format = "jpeg"
     depth: bool = False
+    wrist: bool = False
+    """Whether the wrist camera's views are recorded too, with their depths where those of the front view are."""
     keep_failed: bool = False
     """Whether a failed demonstration is kept and marked as failed; otherwise another table replaces it."""
     backend: Backend = "auto"
@@ -108,13 +110,19 @@ class _ExpertRun:
         """Render `collection.frames` frames; `named` are the demonstration's other fields."""
         steps, keys, ended = self._sample_frames(collection.frames)
         outputs: tuple[Output, ...] = ("color", "depth") if collection.depth else ("color",)
-        seconds, poses, images, depths = [], [], [], []
+        seconds, poses, wrist_poses = [], [], []
+        cameras = ("front", WRIST) if collection.wrist else ("front",)
+        images: dict[str, list[bytes]] = {camera: [] for camera in cameras}
+        depths: dict[str, list[bytes]] = {camera: [] for camera in cameras if collection.depth}
         for moment in self._iterate_states(steps, keys, ended):
-            seen = moment.render_view("front", (collection.size, collection.size), outputs)
             seconds.append(moment.seconds - self._start.seconds)
             poses.append(moment.pose)
-            images.append(encode_image(seen["color"], collection.format))
-            depths += [encode_depth(seen["depth"])] if collection.depth else []
+            wrist_poses.append(moment.get_camera_pose(WRIST))
+            for camera in cameras:
+                seen = moment.render_view(camera, (collection.size, collection.size), outputs)
+                images[camera].append(encode_image(seen["color"], collection.format))
+                if collection.depth:
+                    depths[camera].append(encode_depth(seen["depth"]))
         return Demonstration(
             **named,
             instruction=self._setup.instruction,
@@ -125,8 +133,11 @@ class _ExpertRun:
             actions=np.stack(self._actions)[np.maximum(keys, 1) - 1],
             keys=keys,
             ended=ended,
-            encoded_images=tuple(images),
-            encoded_depths=tuple(depths) if collection.depth else None,
+            encoded_images=tuple(images["front"]),
+            encoded_depths=tuple(depths["front"]) if "front" in depths else None,
+            encoded_wrist_images=tuple(images[WRIST]) if WRIST in images else None,
+            encoded_wrist_depths=tuple(depths[WRIST]) if WRIST in depths else None,
+            wrist_poses=np.stack(wrist_poses) if collection.wrist else None,
         )
 
     def _sample_frames(self, frames: int) -> tuple[NDArray[np.int64], NDArray[np.int32], NDArray[np.bool_]]:

@@ -51,7 +51,7 @@ def export_lerobot(
         episodes, source = navigation.build_episodes(data, workers), navigation.describe_source(data)
         rate, robot = fps if fps is not None else navigation.FPS, "agent"
     else:
-        features = manipulation.describe_features(data.config["size"], data.config["depth"])
+        features = manipulation.describe_features(data.config)
         episodes, source = manipulation.build_episodes(data), manipulation.describe_source(data)
         rate, robot = fps if fps is not None else manipulation.estimate_rate(data), "panda"
     card = build_card(source["what"], len(data), features, rate)

@@ -8,7 +8,7 @@ move by a frame, and the last is repeated.
 from __future__ import annotations
 
 import json
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from itertools import groupby
 from pathlib import Path
 from typing import Any
@@ -18,7 +18,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from wiw.datasets import shards
-from wiw.datasets.demonstration import Demonstration
+from wiw.datasets.demonstration import Demonstration, decode_depths
 from wiw.datasets.demonstrations import Demonstrations, encode_depth
 from wiw.datasets.lerobot.layout import Episode, Feature, color_feature, depth_feature
 from wiw.datasets.lerobot.reading import LeRobotFolder, check_file_name
@@ -26,14 +26,17 @@ from wiw.datasets.parquet_files import MANIFEST
 from wiw.errors import FileError
 
 FRONT, DEPTH = "observation.images.front", "observation.images.front_depth"
+WRIST, WRIST_DEPTH = "observation.images.wrist", "observation.images.wrist_depth"
+WRIST_POSE = "wrist_camera_pose"
 TIFF_DEFLATE = 8
 POSE = ("x_m", "y_m", "z_m", "roll_rad", "pitch_rad", "yaw_rad", "gripper_open")
 FACTS = ("kind", "variation", "seed", "episode", "success", "places", "file")
 """Facts of an episode, beside its frames; kind is the task that wiw knows it by."""
 
 
-def describe_features(size: int, depth: bool) -> dict[str, Feature]:
-    """Return the features of demonstrations with front views of so many pixels square."""
+def describe_features(manifest: Mapping[str, Any]) -> dict[str, Feature]:
+    """Return the features of demonstrations that were collected with the settings of a manifest."""
+    size, depth, wrist = manifest["size"], manifest["depth"], manifest.get("wrist", False)
     features = {
         "observation.state": Feature("where the gripper is, z up, R = Rz Ry Rx", "float64", (7,), POSE),
         "action": Feature("pose that is commanded after this frame, likewise", "float64", (7,), POSE),
@@ -45,6 +48,13 @@ def describe_features(size: int, depth: bool) -> dict[str, Feature]:
     if depth:
         about = "the front view's planar depth, in metres, 0 where nothing is hit"
         features[DEPTH] = depth_feature(about, (size, size), depth_unit="m", measure="planar")
+    if wrist:
+        features[WRIST] = color_feature("the wrist camera's view", (size, size))
+        about = "T_world_camera of the wrist camera, 4 x 4 row by row; it looks along -z with +y up"
+        features[WRIST_POSE] = Feature(about, "float64", (16,))
+    if wrist and depth:
+        about = "planar depth of the wrist camera's view, in metres, 0 where nothing is hit"
+        features[WRIST_DEPTH] = depth_feature(about, (size, size), depth_unit="m", measure="planar")
     return features
 
 
@@ -75,8 +85,11 @@ def _build_episode(each: Demonstration, file: str) -> Episode:
         "ended": each.ended,
         FRONT: each.encoded_images,
     }
-    if each.depths is not None:
-        columns[DEPTH] = [_encode_metres(depth) for depth in each.depths]
+    for name, depths in ((DEPTH, each.encoded_depths), (WRIST_DEPTH, each.encoded_wrist_depths)):
+        if depths is not None:
+            columns[name] = [_encode_metres(depth) for depth in decode_depths(depths)]
+    if each.encoded_wrist_images is not None and each.wrist_poses is not None:
+        columns |= {WRIST: each.encoded_wrist_images, WRIST_POSE: each.wrist_poses.reshape(-1, 16)}
     places = json.dumps({name: pose.tolist() for name, pose in each.places.items()})
     values = each.task, each.variation, each.seed, each.episode, each.success, places, file
     return Episode(each.instruction, columns, dict(zip(FACTS, values, strict=True)))
@@ -100,7 +113,7 @@ def write_demonstrations(found: LeRobotFolder, out: Path, progress: Any) -> None
         FileError: a file or a column is missing or damaged, or the folder cannot be written.
     """
     manifest = found.get_source("manifest", ("tasks", "episodes", "size", "depth"))
-    episodes = found.read_episodes(describe_features(manifest["size"], manifest["depth"]), FACTS)
+    episodes = found.read_episodes(describe_features(manifest), FACTS)
     done = 0
     for name, of_file in groupby(episodes, lambda episode: check_file_name(episode.facts["file"])):
         demonstrations = [build_demonstration(episode) for episode in of_file]
@@ -128,10 +141,16 @@ def build_demonstration(episode: Episode) -> Demonstration:
         keys=columns["key"],
         ended=columns["ended"],
         encoded_images=tuple(columns[FRONT]),
-        encoded_depths=tuple(encode_depth(_decode_metres(each)) for each in columns[DEPTH])
-        if DEPTH in columns
-        else None,
+        encoded_depths=_convert_depths(columns.get(DEPTH)),
+        encoded_wrist_images=tuple(columns[WRIST]) if WRIST in columns else None,
+        encoded_wrist_depths=_convert_depths(columns.get(WRIST_DEPTH)),
+        wrist_poses=columns[WRIST_POSE].reshape(-1, 4, 4) if WRIST_POSE in columns else None,
     )
+
+
+def _convert_depths(depths: Sequence[bytes] | None) -> tuple[bytes, ...] | None:
+    """Return depths of LeRobot as wiw stores them."""
+    return None if depths is None else tuple(encode_depth(_decode_metres(each)) for each in depths)
 
 
 def _encode_metres(depth: NDArray[np.float32]) -> bytes:

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The 3D diffusion policy: gripper paths by denoising, given the front view with its depth.
+"""The 3D diffusion policy: gripper paths by denoising, given views of the scene with their depth.
 
 Paper, appendix "Policies in Embodied Tasks".
 """
@@ -19,9 +19,9 @@ from wiw.errors import ArgumentError, DependencyError
 from wiw.networks import single_thread
 from wiw.policies.base import Policy, Situation
 from wiw.policies.diffuser.paths import densify_path, drop_repeated_poses, thin_path, to_poses, to_vectors
-from wiw.policies.diffuser.workspace import PinholeCamera
-from wiw.tabletop.workbench import CAMERAS
-from wiw.types import GRIPPER_POSES, Proposal
+from wiw.policies.diffuser.workspace import PinholeCamera, WorkspaceView
+from wiw.tabletop.workbench import CAMERAS, WRIST
+from wiw.types import GRIPPER_POSES, ArmObservation, Proposal
 
 if TYPE_CHECKING:
     from wiw.policies.diffuser.network import Network
@@ -48,7 +48,7 @@ class Diffuser(Policy):
     """
 
     space = GRIPPER_POSES
-    needs = ("depth",)
+    needs: tuple[str, ...] = ("depth",)
     default_revision = "scripted"
 
     def __init__(self, weights: str | Path, steps: int = 20) -> None:
@@ -59,6 +59,7 @@ class Diffuser(Policy):
 
         self.steps = steps
         self._network, self.card = load(weights)
+        self.needs = choose_needs(self._network)
         self._digest = blake2b(Path(weights).expanduser().read_bytes(), digest_size=8).hexdigest()
 
     @classmethod
@@ -66,6 +67,7 @@ class Diffuser(Policy):
         """Create the policy from a network in memory, such as one in training."""
         policy = cls.__new__(cls)
         policy.steps, policy._network, policy.card, policy._digest = steps, network.eval(), {}, ""
+        policy.needs = choose_needs(network)
         return policy
 
     def describe(self) -> dict[str, Any]:
@@ -89,19 +91,35 @@ class Diffuser(Policy):
         import torch
 
         from wiw.policies.diffuser.diffusion import sample_ddim
+        from wiw.policies.diffuser.network import stack_views
 
-        observation, pose, network = situation.observation, situation.observation.pose, self._network
-        view = PinholeCamera.from_camera(CAMERAS["front"], observation.depth.shape).view_workspace(
-            observation.front, observation.depth
-        )
+        pose, network = situation.observation.pose, self._network
+        views = view_scene(situation.observation, network.shape.wrist)
         drawn = [torch.randn(network.shape.poses, 9, generator=torch.Generator().manual_seed(seed)) for seed in seeds]
         with single_thread(), torch.inference_mode():
-            inputs = view.image, view.height, view.places, to_vectors(pose)
-            image, height, places, now = (torch.from_numpy(each)[None] for each in inputs)
-            scene = network.encode_scene(image, height, places, now)
+            now = torch.from_numpy(to_vectors(pose))[None]
+            scene = network.encode_scene([stack_views([each]) for each in views], now)
             noise = torch.stack(drawn)[None]
             clean, open_ = sample_ddim(lambda noised, level: network.denoise(scene, noised, level), noise, self.steps)
             return to_poses(torch.cat([clean, open_[..., None]], dim=-1)[0].numpy())
+
+
+def choose_needs(network: Network) -> tuple[str, ...]:
+    """Return what observations must have for a network."""
+    return ("depth", "wrist") if network.shape.wrist else ("depth",)
+
+
+def view_scene(observation: ArmObservation, wrist: bool) -> list[WorkspaceView]:
+    """Return what the cameras see of the workspace: the front one, and that on the hand where asked for."""
+    assert observation.depth is not None
+    front = PinholeCamera.from_camera(CAMERAS["front"], observation.depth.shape)
+    views = [front.view_workspace(observation.front, observation.depth)]
+    if wrist:
+        seen = observation.wrist
+        assert seen is not None and seen.depth is not None
+        camera = PinholeCamera.from_camera(CAMERAS[WRIST], seen.depth.shape, seen.T_world_camera)
+        views.append(camera.view_from_wrist(seen.image, seen.depth))
+    return views
 
 
 def require_torch() -> None:

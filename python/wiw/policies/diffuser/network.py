@@ -7,8 +7,10 @@ noised poses of a path are tokens at theirs, and attention relates them by relat
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
+import numpy as np
 import torch
 from torch import Tensor, nn
 from torch.nn import functional
@@ -17,7 +19,7 @@ from wiw.errors import ArgumentError
 from wiw.policies.diffuser.attention import RelativeAttention
 from wiw.policies.diffuser.diffusion import NOISE_LEVELS
 from wiw.policies.diffuser.paths import MIDDLE, SCALE
-from wiw.policies.diffuser.workspace import CELL
+from wiw.policies.diffuser.workspace import CELL, WorkspaceView
 
 
 @dataclass(frozen=True)
@@ -33,13 +35,27 @@ class Shape:
     layers: int = 4
     """Layers of the denoiser."""
     tokens: int = 640
-    """Most tokens of a scene."""
+    """Most tokens of a view."""
     poses: int = 6
     """Poses of a path."""
+    wrist: bool = False
+    """Whether scenes are seen by the wrist camera, too."""
 
     def __post_init__(self) -> None:
         if min(self.width, self.heads, self.layers, self.tokens, self.poses) < 1 or self.width % (6 * self.heads):
             raise ArgumentError(f"diffuser: expected numbers from 1 and a width of 6 heads times something, got {self}")
+
+
+@dataclass(frozen=True)
+class Views:
+    """The images of B scenes by one camera, as in `WorkspaceView`."""
+
+    image: Tensor
+    """uint8 [B, h, w, 3]."""
+    height: Tensor
+    """[B, h, w]."""
+    places: Tensor
+    """[B, h / CELL, w / CELL, 3]."""
 
 
 @dataclass(frozen=True)
@@ -82,22 +98,25 @@ class Network(nn.Module):
         self.norm = nn.LayerNorm(width)
         self.last = nn.Linear(width, 10)
 
-    def encode_scene(self, image: Tensor, height: Tensor, places: Tensor, now: Tensor) -> EncodedScene:
-        """Encode an image and the gripper's pose.
+    def encode_scene(self, views: Sequence[Views], now: Tensor) -> EncodedScene:
+        """Encode what each camera sees, by the same convolutions, and the gripper's pose.
 
         Args:
-            image: uint8 [B, h, w, 3].
-            height: [B, h, w], heights of its pixels, as in `WorkspaceView`.
-            places: [B, h / CELL, w / CELL, 3], likewise.
+            views: one of the front camera, and one of the wrist camera where `shape.wrist` says so.
             now: [B, 10], the gripper's present vector.
         """
-        seen = torch.cat([image / 127.5 - 1, height[..., None].float()], dim=-1).permute(0, 3, 1, 2)
-        features = self.eye(seen).flatten(2).transpose(1, 2)
-        tokens, places, hidden = _select_workspace_tokens(features, places.flatten(1, 2), self.shape.tokens)
+        seen = [self._encode_view(each) for each in views]
         hand = self.hand(now[:, 3:])
-        tokens = torch.cat([tokens, hand[:, None]], dim=1)
-        places = torch.cat([places, to_metres(now[:, None, :3])], dim=1)
+        tokens = torch.cat([*(tokens for tokens, _, _ in seen), hand[:, None]], dim=1)
+        places = torch.cat([*(places for _, places, _ in seen), to_metres(now[:, None, :3])], dim=1)
+        hidden = torch.cat([hidden for _, _, hidden in seen], dim=1)
         return EncodedScene(tokens, places, functional.pad(hidden, (0, 1), value=False), hand)
+
+    def _encode_view(self, view: Views) -> tuple[Tensor, Tensor, Tensor]:
+        """Return the tokens of one camera's view: features, positions, and which are padding."""
+        seen = torch.cat([view.image / 127.5 - 1, view.height[..., None].float()], dim=-1).permute(0, 3, 1, 2)
+        features = self.eye(seen).flatten(2).transpose(1, 2)
+        return _select_workspace_tokens(features, view.places.flatten(1, 2), self.shape.tokens)
 
     def denoise(self, scene: EncodedScene, noised: Tensor, level: Tensor) -> tuple[Tensor, Tensor]:
         """Return clean vectors [B, R, L, 9] and the gripper's logits [B, R, L] of R paths per scene at levels [B,
@@ -158,6 +177,14 @@ class Block(nn.Module):
     def forward(self, image: Tensor) -> Tensor:
         """Return [B, width, H, W]."""
         return image + self.inner(image)
+
+
+def stack_views(views: Sequence[WorkspaceView]) -> Views:
+    """Return views of B scenes by one camera as tensors."""
+    image, height, places = (
+        torch.from_numpy(np.stack([getattr(view, name) for view in views])) for name in ("image", "height", "places")
+    )
+    return Views(image, height, places)
 
 
 def to_metres(vectors: Tensor) -> Tensor:

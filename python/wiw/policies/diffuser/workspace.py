@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The policy's input: the part of an image that shows the workspace, and the 3D positions of its pixels."""
+"""The policy's input: parts of images that show the workspace, and the 3D positions of their pixels."""
 
 from __future__ import annotations
 
@@ -14,6 +14,8 @@ from wiw.tabletop.workbench import TABLE, Camera
 
 CELL = 8
 """Side in pixels of the cell that becomes one token."""
+WRIST_SIZE = 120
+"""Side in pixels that the wrist camera's view is reduced to: it is near to what it sees."""
 WORKSPACE = np.array([[-0.06, -0.34, TABLE - 0.01], [0.40, 0.34, TABLE + 0.12]])
 """Least and greatest x, y, z of the workspace, in metres."""
 NOWHERE = (0.0, 0.0, -10.0)
@@ -26,7 +28,7 @@ HEIGHT_UNIT = 0.1
 
 @dataclass(frozen=True)
 class WorkspaceView:
-    """The part of an image that shows the workspace; h and w are multiples of `CELL`."""
+    """An image of the workspace, or part of an image; h and w are multiples of `CELL`."""
 
     image: NDArray[np.uint8]
     """uint8 [..., h, w, 3]."""
@@ -49,11 +51,18 @@ class PinholeCamera:
     T_world_camera: NDArray[np.float64]
 
     @classmethod
-    def from_camera(cls, camera: Camera, size: tuple[int, int]) -> PinholeCamera:
-        """Create the model of a fixed camera of the workbench."""
+    def from_camera(
+        cls, camera: Camera, size: tuple[int, ...], T_world_camera: NDArray[np.float64] | None = None
+    ) -> PinholeCamera:
+        """Create the model of a camera of the workbench; one on the hand is where `T_world_camera` says."""
         height, width = size
         focal = width / 2 / np.tan(np.radians(camera.hfov_deg) / 2)
-        return cls(np.array([[focal, 0, width / 2], [0, focal, height / 2], [0, 0, 1]]), camera.pose)
+        intrinsics = np.array([[focal, 0, width / 2], [0, focal, height / 2], [0, 0, 1]])
+        return cls(intrinsics, camera.pose if T_world_camera is None else T_world_camera)
+
+    def reduce(self, factor: int) -> PinholeCamera:
+        """Return the camera of images whose sides are so many times shorter."""
+        return PinholeCamera(np.diag([1 / factor, 1 / factor, 1.0]) @ self.intrinsics, self.T_world_camera)
 
     def find_window(self, size: tuple[int, int]) -> tuple[slice, slice]:
         """Return rows and columns around the workspace in an image [height, width], whole cells.
@@ -83,11 +92,34 @@ class PinholeCamera:
             ArgumentError: the workspace is not in view.
         """
         rows, columns = self.find_window(depth.shape)
-        points = self.crop(rows, columns).unproject(depth[rows, columns])
+        return self.crop(rows, columns)._view(image[rows, columns], depth[rows, columns])
+
+    def view_from_wrist(self, image: NDArray[np.uint8], depth: NDArray[np.float32]) -> WorkspaceView:
+        """Return the whole image [H, W, 3] with planar depth [H, W] in metres, reduced to `WRIST_SIZE`.
+
+        A reduced pixel has the mean colour of its pixels, and the depth of the one in its middle, lest there be points
+        between an edge and what is behind it.
+
+        Raises:
+            ArgumentError: the image is not square, or its side is no multiple of `WRIST_SIZE`.
+        """
+        factor, rest = divmod(depth.shape[0], WRIST_SIZE)
+        if depth.shape[0] != depth.shape[1] or rest or not factor:
+            raise ArgumentError(
+                f"the wrist camera's view: expected a square with a side that is a multiple of {WRIST_SIZE}, got "
+                f"{depth.shape[0]}x{depth.shape[1]}"
+            )
+        blocks = image.reshape(WRIST_SIZE, factor, WRIST_SIZE, factor, 3)
+        middles = slice(factor // 2, None, factor)
+        reduced = np.rint(blocks.mean(axis=(1, 3), dtype=np.float32)).astype(np.uint8)
+        return self.reduce(factor)._view(reduced, depth[middles, middles])
+
+    def _view(self, image: NDArray[np.uint8], depth: NDArray[np.float32]) -> WorkspaceView:
+        points = self.unproject(depth)
         middles = slice(CELL // 2, None, CELL)
         height = np.clip((points[..., 2] - TABLE) / HEIGHT_UNIT, -1, 2)
         return WorkspaceView(
-            np.ascontiguousarray(image[rows, columns]),
+            np.ascontiguousarray(image),
             height.astype(np.float16),
             points[middles, middles].astype(np.float32, order="C"),
         )
