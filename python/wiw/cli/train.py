@@ -123,7 +123,7 @@ def train(
     $ wiw run imagenav --world-model warpnet --world-model-option weights=warpnet.safetensors
     $ wiw train perception --out perception.safetensors
     $ wiw train armnet --out armnet.safetensors
-    $ wiw collect manipulation --episodes 120 --frames 16 --depth --out demos
+    $ wiw collect manipulation --episodes 120 --frames 16 --depth --wrist --out demos
     $ wiw train diffuser --demonstrations demos --out diffuser.safetensors
     $ wiw collect navigation --scenes apartments:train:80 --out data
     $ wiw train pocket --data data --out pocket.safetensors
@@ -182,7 +182,8 @@ def train(
             recogniser splits them, or the samples of a single one, into halves for calibration and evaluation. Default:
             apartments:val:20.
         categories: What recogniser tells apart. Default: the built-in list of 26 categories.
-        demonstrations: Folder of `wiw collect manipulation`: with depth for diffuser; additional data for armnet.
+        demonstrations: Folder of `wiw collect manipulation`: with depth for diffuser, which learns to see by the wrist camera
+            too if they have its views; additional data for armnet.
         epochs: How often each sample is used, on average. Default: 25 for recogniser, 6 for warpnet, 1 for pocket, 4
             for navigator, perception and armnet, 400 for diffuser.
         minutes: Train fewer epochs if all of them would take longer than this.
