@@ -82,7 +82,7 @@ class Network(nn.Module):
         super().__init__()
         width, self.shape = shape.width, shape
         fine, coarse = width // 3, 2 * width // 3
-        self.eye = nn.Sequential(
+        self.encoder = nn.Sequential(
             nn.Conv2d(4, fine, CELL // 2, CELL // 2),
             Block(fine),
             nn.Conv2d(fine, coarse, 3, 2, padding=1),
@@ -90,13 +90,13 @@ class Network(nn.Module):
             Block(coarse, 2),
             nn.Conv2d(coarse, width, 1),
         )
-        self.hand = nn.Sequential(nn.Linear(7, width), nn.SiLU(), nn.Linear(width, width))
-        self.start = nn.Linear(6, width)
-        self.order = nn.Parameter(torch.randn(shape.poses, width) * 0.5)
-        self.level = nn.Sequential(nn.Linear(32, width), nn.SiLU(), nn.Linear(width, width))
+        self.embed_hand = nn.Sequential(nn.Linear(7, width), nn.SiLU(), nn.Linear(width, width))
+        self.embed_rotation = nn.Linear(6, width)
+        self.order_embedding = nn.Parameter(torch.randn(shape.poses, width) * 0.5)
+        self.embed_level = nn.Sequential(nn.Linear(32, width), nn.SiLU(), nn.Linear(width, width))
         self.layers = nn.ModuleList(Layer(width, shape.heads) for _ in range(shape.layers))
         self.norm = nn.LayerNorm(width)
-        self.last = nn.Linear(width, 10)
+        self.head = nn.Linear(width, 10)
 
     def encode_scene(self, views: Sequence[Views], now: Tensor) -> EncodedScene:
         """Encode what each camera sees, by the same convolutions, and the gripper's pose.
@@ -106,7 +106,7 @@ class Network(nn.Module):
             now: [B, 10], the gripper's present vector.
         """
         seen = [self._encode_view(each) for each in views]
-        hand = self.hand(now[:, 3:])
+        hand = self.embed_hand(now[:, 3:])
         tokens = torch.cat([*(tokens for tokens, _, _ in seen), hand[:, None]], dim=1)
         places = torch.cat([*(places for _, places, _ in seen), to_metres(now[:, None, :3])], dim=1)
         hidden = torch.cat([hidden for _, _, hidden in seen], dim=1)
@@ -115,49 +115,53 @@ class Network(nn.Module):
     def _encode_view(self, view: Views) -> tuple[Tensor, Tensor, Tensor]:
         """Return the tokens of one camera's view: features, positions, and which are padding."""
         seen = torch.cat([view.image / 127.5 - 1, view.height[..., None].float()], dim=-1).permute(0, 3, 1, 2)
-        features = self.eye(seen).flatten(2).transpose(1, 2)
+        features = self.encoder(seen).flatten(2).transpose(1, 2)
         return _select_workspace_tokens(features, view.places.flatten(1, 2), self.shape.tokens)
 
     def denoise(self, scene: EncodedScene, noised: Tensor, level: Tensor) -> tuple[Tensor, Tensor]:
-        """Return clean vectors [B, R, L, 9] and the gripper's logits [B, R, L] of R paths per scene at levels [B,
-        R].
+        """Return clean vectors [B, R, L, 9] and the gripper's logits [B, R, L].
+
+        Args:
+            scene: B scenes.
+            noised: [B, R, L, 9], R paths per scene.
+            level: int64 [B, R], their noise levels.
         """
-        condition = self.level(_embed_level(level)) + scene.hand[:, None]
-        tokens = self.start(noised[..., 3:]) + self.order
+        condition = self.embed_level(_encode_level(level)) + scene.hand[:, None]
+        tokens = self.embed_rotation(noised[..., 3:]) + self.order_embedding
         places = to_metres(noised[..., :3])
         for layer in self.layers:
             tokens = layer(tokens, places, scene, condition=condition)
-        found = self.last(self.norm(tokens))
+        found = self.head(self.norm(tokens))
         clean = torch.cat([noised[..., :3] + found[..., :3], found[..., 3:9]], dim=-1)
         return clean, found[..., 9]
 
 
 class Layer(nn.Module):
-    """Attention to the scene and to the other poses of the path, and a feed-forward network. `told` modulates the
-    norms.
-    """
+    """Attention to the scene, attention among the poses of a path, and a feed-forward network, with modulated norms."""
 
     def __init__(self, width: int, heads: int) -> None:
         super().__init__()
-        self.crossing, self.among = RelativeAttention(width, heads), RelativeAttention(width, heads)
-        self.think = nn.Sequential(nn.Linear(width, 2 * width), nn.GELU(), nn.Linear(2 * width, width))
+        self.cross_attention, self.self_attention = RelativeAttention(width, heads), RelativeAttention(width, heads)
+        self.feed_forward = nn.Sequential(nn.Linear(width, 2 * width), nn.GELU(), nn.Linear(2 * width, width))
         self.norms = nn.ModuleList(nn.LayerNorm(width, elementwise_affine=False) for _ in range(3))
-        self.told = nn.Linear(width, 6 * width)
+        self.modulation = nn.Linear(width, 6 * width)
 
     def forward(self, tokens: Tensor, places: Tensor, scene: EncodedScene, condition: Tensor) -> Tensor:
         """Update tokens [B, R, L, width] of R paths per scene; `condition` [B, R, width] encodes noise level and
         hand.
         """
-        scales = self.told(condition)[..., None, :].chunk(6, dim=-1)
+        scales = self.modulation(condition)[..., None, :].chunk(6, dim=-1)
 
-        def normal(which: int) -> Tensor:
+        def normalise(which: int) -> Tensor:
             return self.norms[which](tokens) * (1 + scales[2 * which]) + scales[2 * which + 1]
 
-        asking, here = normal(0).flatten(1, 2), places.flatten(1, 2)  # all paths of a scene in one go
-        tokens = tokens + self.crossing(asking, here, scene.tokens, scene.places, scene.hidden).view_as(tokens)
-        path, here = normal(1).flatten(0, 1), places.flatten(0, 1)
-        tokens = tokens + self.among(path, here, path, here).view_as(tokens)
-        return tokens + self.think(normal(2))
+        queries, positions = normalise(0).flatten(1, 2), places.flatten(1, 2)  # all paths of a scene in one go
+        tokens = tokens + self.cross_attention(queries, positions, scene.tokens, scene.places, scene.hidden).view_as(
+            tokens
+        )
+        path, positions = normalise(1).flatten(0, 1), places.flatten(0, 1)
+        tokens = tokens + self.self_attention(path, positions, path, positions).view_as(tokens)
+        return tokens + self.feed_forward(normalise(2))
 
 
 class Block(nn.Module):
@@ -202,8 +206,8 @@ def _select_workspace_tokens(features: Tensor, places: Tensor, most: int) -> tup
     return features.gather(1, order.expand(-1, -1, features.shape[2])), places, hidden
 
 
-def _embed_level(level: Tensor) -> Tensor:
-    """Embed a noise level as sines and cosines, [..., 32]."""
+def _encode_level(level: Tensor) -> Tensor:
+    """Encode a noise level as sines and cosines, [..., 32]."""
     rates = torch.logspace(0, 2, 16)
     angles = level[..., None] / NOISE_LEVELS * rates
     return torch.cat([angles.sin(), angles.cos()], dim=-1)
