@@ -182,8 +182,8 @@ def train(
             recogniser splits them, or the samples of a single one, into halves for calibration and evaluation. Default:
             apartments:val:20.
         categories: What recogniser tells apart. Default: the built-in list of 26 categories.
-        demonstrations: Folder of `wiw collect manipulation`: with depth for diffuser, which learns to see by the wrist camera
-            too if they have its views; additional data for armnet.
+        demonstrations: Folder of `wiw collect manipulation`: with depth for diffuser, which learns to see by the wrist
+            camera too if they have its views; additional data for armnet.
         epochs: How often each sample is used, on average. Default: 25 for recogniser, 6 for warpnet, 1 for pocket, 4
             for navigator, perception and armnet, 400 for diffuser.
         minutes: Train fewer epochs if all of them would take longer than this.
