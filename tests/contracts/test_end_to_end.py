@@ -146,14 +146,18 @@ def views(strip: Any) -> list[Any]:
     return [strip[-VIEW:, x : x + VIEW] for x in left]
 
 
-OF_EVERY_KIND = ("none", "copy", "oracle", "remote:", "wan2.1", "svd-action")
-"""World models by whom both navigation tasks are run for every change; by the others recognition alone is."""
+OF_EVERY_KIND = ("none", "copy", "oracle", "remote:", "armnet", "wan2.1", "svd-action")
+"""World models with which all tasks are run for every change; with the others recognition alone is."""
+
+
+def nightly_unless(condition: bool) -> list[pytest.MarkDecorator]:
+    return [] if condition else [pytest.mark.nightly]
 
 
 @pytest.mark.parametrize(
     ("name", "task"),
     [
-        pytest.param(name, task, marks=[] if task == "ar" or name in OF_EVERY_KIND else [pytest.mark.nightly])
+        pytest.param(name, task, marks=nightly_unless(task == "ar" or name in OF_EVERY_KIND))
         for name in NAMES
         for task in TASKS
     ],
@@ -178,7 +182,7 @@ def test_an_episode_with_every_world_model(name: str, task: str, run: Any, made:
         assert [np.ptp(view) > 0 for view in views(strip)] == [True, True]
 
 
-@pytest.mark.parametrize("name", NAMES)
+@pytest.mark.parametrize("name", [pytest.param(name, marks=nightly_unless(name in OF_EVERY_KIND)) for name in NAMES])
 def test_an_arm_with_every_world_model(name: str, run: Any, made: Any, server: VlmServer) -> None:
     model = made(name, "pose7")
     if name in MOVES_A_CAMERA:

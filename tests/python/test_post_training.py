@@ -30,7 +30,7 @@ pytest.importorskip("pyarrow", reason="no pyarrow: pip install 'wiw[export]'")
 
 import torch
 from folders import contents
-from post_training_parts import make_trainer, save_dataset, save_stock, tiny_recipe
+from post_training_parts import make_trainer, save_dataset, save_stock, tiny_recipe, with_nightly
 
 import tiny_pipelines
 from wiw.training.post_training.clip_order import ClipOrder
@@ -64,7 +64,12 @@ def weights(tmp_path_factory: pytest.TempPathFactory):
 # -- every recipe ------------------------------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize("name", NAMES)
+EVERY_KIND = ("ltx-action", "nwm-action", "wan2.2-a14b-action")
+"""A video generator, another trainable model, and one of two experts: what hardly differs between families is tried on
+these for every change."""
+
+
+@pytest.mark.parametrize("name", with_nightly(NAMES, EVERY_KIND))
 def test_the_loss_falls_on_four_clips_learnt_by_heart(name: str, data: Path, weights: Any) -> None:
     """Measured on the same noise before and after."""
     trainer = make_trainer(name, data, weights(name), epochs=STEPS[name], drop=0.0, checkpointing=False)
@@ -100,7 +105,7 @@ def test_the_first_frame_is_given_and_out_of_the_loss(name: str, data: Path, wei
     assert (measure() - before).abs().min() > 1e-6  # the denoiser sees the one that is given
 
 
-@pytest.mark.parametrize("name", NAMES)
+@pytest.mark.parametrize("name", with_nightly(NAMES, EVERY_KIND))
 def test_each_recipe_resumes_exactly(name: str, data: Path, weights: Any) -> None:
     """From the middle; where there are two experts, from the middle of the second."""
     changes = {"epochs": 4, "batch": 4, "rows": 4}
@@ -152,7 +157,7 @@ def test_each_expert_is_trained_on_its_side_of_the_boundary(data: Path, weights:
     assert moved and not any("transformer_2" in key for key in moved)
 
 
-@pytest.mark.parametrize("name", NAMES)
+@pytest.mark.parametrize("name", with_nightly(NAMES, EVERY_KIND))
 def test_half_precision_trains_weights_in_float32(name: str, data: Path, weights: Any) -> None:
     trainer = make_trainer(name, data, weights(name), precision="bfloat16")
     assert np.isfinite(trainer.train_step(1e-3)) and np.isfinite(trainer.train_step(1e-3))
