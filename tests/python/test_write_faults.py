@@ -26,8 +26,7 @@ from wiw.runs.store import RunStore, store_path
 
 SMALL = {"episodes": 2, "keep_images": 1}
 SAMPLE = 4
-"""Faults of each job that are tried for every change; half as many of those that share how they write (`FILES`), in ways
-that take turns."""
+"""Faults of each job that are tried for every change; of `FILES`, which share how they write, half as many."""
 
 
 @dataclass
