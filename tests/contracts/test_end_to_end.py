@@ -240,7 +240,7 @@ KINDS = [
     ("perspective", None, ("depth",)),
     ("perspective", (272, 480), ()),
     ("panorama", None, ()),
-    ("panorama", None, ("depth",)),
+    pytest.param(("panorama", None, ("depth",)), marks=pytest.mark.nightly),
     ("panorama", None, ("depth", "semantic")),
 ]
 

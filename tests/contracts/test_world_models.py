@@ -53,7 +53,9 @@ def imagined(name_or_model, two_rooms: str, episodes: int = 2, plans=PLANS, firs
     return space.imagine(Attempted(model), request).rollouts
 
 
-@pytest.mark.parametrize("name", NAMES)
+@pytest.mark.parametrize(
+    "name", [pytest.param(name, marks=[pytest.mark.nightly] if f"{name}-action" in NAMES else []) for name in NAMES]
+)
 def test_every_model_keeps_the_contract(name: str, two_rooms: str, world_model_options) -> None:
     options = world_model_options(name)
     if name in SMALL:
