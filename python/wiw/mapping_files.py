@@ -3,6 +3,8 @@
 
 from __future__ import annotations
 
+from copy import deepcopy
+from functools import lru_cache
 from pathlib import Path
 from typing import Any
 
@@ -38,12 +40,17 @@ def parse_yaml(text: str) -> Any:
         ValueError: its lists and mappings are nested too deeply.
         yaml.YAMLError: it is no YAML.
     """
-    import yaml
-
     try:
-        return yaml.safe_load(text)
+        return deepcopy(_parse_yaml_once(text))
     except RecursionError:
         raise ValueError("expected lists and mappings that are nested less deeply") from None
+
+
+@lru_cache(maxsize=64)  # every task reads its presets anew, and parsing takes longer than all else that makes a task
+def _parse_yaml_once(text: str) -> Any:
+    import yaml
+
+    return yaml.safe_load(text)
 
 
 def read_json_object(path: Path, expected: str) -> dict[str, Any]:

@@ -146,8 +146,22 @@ def views(strip: Any) -> list[Any]:
     return [strip[-VIEW:, x : x + VIEW] for x in left]
 
 
-@pytest.mark.parametrize("task", TASKS)
-@pytest.mark.parametrize("name", NAMES)
+OF_EVERY_KIND = ("none", "copy", "oracle", "remote:", "armnet", "wan2.1", "svd-action")
+"""World models with which all tasks are run for every change; with the others recognition alone is."""
+
+
+def nightly_unless(condition: bool) -> list[pytest.MarkDecorator]:
+    return [] if condition else [pytest.mark.nightly]
+
+
+@pytest.mark.parametrize(
+    ("name", "task"),
+    [
+        pytest.param(name, task, marks=nightly_unless(task == "ar" or name in OF_EVERY_KIND))
+        for name in NAMES
+        for task in TASKS
+    ],
+)
 def test_an_episode_with_every_world_model(name: str, task: str, run: Any, made: Any, server: VlmServer) -> None:
     if name in MOVES_AN_ARM:
         with pytest.raises(ArgumentError, match="discrete primitives"):
@@ -168,7 +182,7 @@ def test_an_episode_with_every_world_model(name: str, task: str, run: Any, made:
         assert [np.ptp(view) > 0 for view in views(strip)] == [True, True]
 
 
-@pytest.mark.parametrize("name", NAMES)
+@pytest.mark.parametrize("name", [pytest.param(name, marks=nightly_unless(name in OF_EVERY_KIND)) for name in NAMES])
 def test_an_arm_with_every_world_model(name: str, run: Any, made: Any, server: VlmServer) -> None:
     model = made(name, "pose7")
     if name in MOVES_A_CAMERA:
@@ -226,7 +240,7 @@ KINDS = [
     ("perspective", None, ("depth",)),
     ("perspective", (272, 480), ()),
     ("panorama", None, ()),
-    ("panorama", None, ("depth",)),
+    pytest.param(("panorama", None, ("depth",)), marks=pytest.mark.nightly),
     ("panorama", None, ("depth", "semantic")),
 ]
 

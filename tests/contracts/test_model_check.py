@@ -301,8 +301,9 @@ def test_models_of_grippers_are_asked_about_poses(declared):
         accepts = wiw.accepts(**{**GRIPPER, "causal": True, **declared})
 
     assert found(Asked, "nowhere") == {}
-    findings = found(type("Ahead", (Foreseeing,), {"accepts": Asked.accepts}), "nowhere")
-    assert set(findings) == {"causal"} and "a changed action change with it" in str(findings["causal"])
+    if declared in ({}, PAST):
+        findings = found(type("Ahead", (Foreseeing,), {"accepts": Asked.accepts}), "nowhere")
+        assert set(findings) == {"causal"} and "a changed action change with it" in str(findings["causal"])
 
 
 def test_a_gripper_that_is_not_looked_at_is_noted(monkeypatch):

@@ -29,7 +29,7 @@ SPIN = ([TURN_LEFT] * 5, [TURN_RIGHT] * 5, [TURN_LEFT] * 3)
 class _Fixed(wiw.Policy):
     """Always the same plans, of which the first is preferred."""
 
-    frames = FrameSpec("front", (16, 16))
+    frames = FrameSpec("front", (16, 16), source_size=(144, 256))
     plans: Any = FAN
 
     def propose(self, situations: Any, candidates: int, horizon: int) -> list[list[Proposal]]:

@@ -23,7 +23,7 @@ PYTHON = Path(__file__).parents[2] / "python"
 
 @pytest.fixture(scope="module")
 def scene() -> wiw.scenes.Scene:
-    return wiw.scenes.apartment(5, "val")
+    return wiw.scenes.apartment(3, "val")
 
 
 def test_it_tells_what_is_where(scene: wiw.scenes.Scene) -> None:
@@ -83,7 +83,7 @@ def test_an_unknown_split_is_refused() -> None:
 
 _DIGEST = """
 import hashlib, numpy, wiw.scenes, wiw.render
-scene = wiw.scenes.apartment(2, "train")
+scene = wiw.scenes.apartment(2, "train", cache=False)
 pose = numpy.eye(4)
 pose[:3, 3] = scene.rooms[0]["bounds"].mean(axis=0)
 color = wiw.render.Renderer(scene, backend="cpu").panorama(pose[None], (288, 512), outputs=("color",))["color"]
@@ -92,6 +92,7 @@ print(hashlib.sha256(data).hexdigest(), wiw._core.core.num_threads())
 """
 
 
+@pytest.mark.nightly
 def test_bytes_are_the_same_in_another_process_with_another_number_of_threads() -> None:
     def digest(threads: int) -> list[str]:
         environment = {**os.environ, "WIW_NUM_THREADS": str(threads), "PYTHONPATH": str(PYTHON)}

@@ -23,8 +23,8 @@ from wiw.files import atomic_file, atomic_folder
 from wiw.runs.store import RunStore, store_path
 from wiw.studies.run_log import load_run
 
-KILLS = [(40, 6, 30), pytest.param((1500, 200, 300), marks=[pytest.mark.nightly, pytest.mark.timeout(7200)])]
-"""Kills of runs, of each shard, and of exports: 82 for every change, 2,200 nightly."""
+KILLS = [(20, 4, 16), pytest.param((1500, 200, 300), marks=[pytest.mark.nightly, pytest.mark.timeout(7200)])]
+"""Kills of runs, of each shard, and of exports: 44 for every change, 2,200 nightly."""
 HERE = Path(__file__).parent
 
 

@@ -489,7 +489,7 @@ KINDS = (
 @pytest.mark.parametrize("kind", KINDS)
 def test_mutations_end_in_errors_of_wiw(tmp_path: Path, kind: str) -> None:
     """Readers may crash on what nobody foresaw, in a process of their own; any other error than wiw's is a defect."""
-    check_mutations(tmp_path, kind, 60)
+    check_mutations(tmp_path, kind, 30)
 
 
 @pytest.mark.nightly

@@ -256,8 +256,7 @@ def test_choosing_by_imagination_pays(tmp_path: Path) -> None:
         "swapped": AgentRecipe(Reacher(), "oracle", placebo="swapped"),
     }
     runs = {
-        name: evaluate(DotTask(), agent, 10, out=tmp_path / name, live=5, progress=False)
-        for name, agent in arms.items()
+        name: evaluate(DotTask(), agent, 6, out=tmp_path / name, live=3, progress=False) for name, agent in arms.items()
     }
     rates = {name: np.mean([e["metrics"]["success"] for e in log.episodes]) for name, log in runs.items()}
     assert all(e["status"] == "done" for log in runs.values() for e in log.episodes)

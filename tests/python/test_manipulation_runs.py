@@ -176,6 +176,7 @@ def test_a_run_says_which_renderer_drew_it() -> None:
     assert Manipulation.make_portable({"tasks": "all"}) == {"tasks": "all", "backend": resolve_backend("auto")}
 
 
+@pytest.mark.nightly
 def test_failures_have_a_stage_to_blame(tmp_path: Path) -> None:
     """One push is within four poses of one who is told the truth; two are not, whoever is told."""
     agent = AgentRecipe(POLICY, "copy", candidates=2)

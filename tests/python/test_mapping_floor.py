@@ -17,7 +17,7 @@ from wiw.mapping.occupancy import CELL, OccupancyGrid
 from wiw.mapping.openings import name_openings
 from wiw.mapping.routes import RADIUS, STEP, find_refused, follow_heading, measure_distances, route
 
-SCENES = ["apartments:val/3", "apartments:val/12"]
+SCENES = ["apartments:val/3", "apartments:val/1"]
 
 
 def make_grid(picture: str) -> OccupancyGrid:

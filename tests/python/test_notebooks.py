@@ -11,7 +11,7 @@ nbformat = pytest.importorskip("nbformat")
 
 FOLDER = Path(__file__).parents[2] / "notebooks"
 SIZES = {  # names of the cell that is tagged "parameters", and what is enough to run every cell
-    "01_quickstart": {"decisions": 4},
+    "01_quickstart": {"decisions": 2},
     "02_compare_world_models": {"apartments": 2, "starts": 1, "decisions": 2},
     "03_plug_in_your_model": {"apartments": 2, "places": 16, "training_steps": 20, "starts": 1, "decisions": 2},
     "04_answer_questions": {"apartments": 4, "questions": 2, "actions": 15},

@@ -224,7 +224,7 @@ def test_a_swapped_placebo_is_of_the_runs_next_episode(two_rooms) -> None:
 @pytest.fixture(scope="module")
 def run(two_rooms, tmp_path_factory):
     """The same arms with one worker and several episodes live, and with two workers."""
-    task = TaskRecipe("imagenav", {"scenes": two_rooms, "decisions": 3})
+    task = TaskRecipe("imagenav", {"scenes": two_rooms, "decisions": 2})
     agent = AgentRecipe("heuristic", "copy", reviser="matcher")
     arms = ["copy", "placebo-shuffled", "placebo-swapped", "placebo-swapped:oracle"]
 

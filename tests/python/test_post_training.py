@@ -30,7 +30,7 @@ pytest.importorskip("pyarrow", reason="no pyarrow: pip install 'wiw[export]'")
 
 import torch
 from folders import contents
-from post_training_parts import make_trainer, save_dataset, save_stock, tiny_recipe
+from post_training_parts import make_trainer, save_dataset, save_stock, tiny_recipe, with_nightly
 
 import tiny_pipelines
 from wiw.training.post_training.clip_order import ClipOrder
@@ -48,7 +48,7 @@ pytestmark = pytest.mark.usefixtures("one_torch_thread")
 
 NAMES = sorted(FAMILIES)
 GENERATORS = sorted(name for name, family in FAMILIES.items() if isinstance(family, VideoFamily))
-STEPS = {name: 6 if name in ("svd-action", "wan2.2-a14b-action") else 12 for name in NAMES}
+STEPS = {name: {"svd-action": 3, "wan2.2-a14b-action": 4}.get(name, 6) for name in NAMES}
 
 
 @pytest.fixture(scope="module")
@@ -64,7 +64,12 @@ def weights(tmp_path_factory: pytest.TempPathFactory):
 # -- every recipe ------------------------------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize("name", NAMES)
+EVERY_KIND = ("ltx-action", "nwm-action", "wan2.2-a14b-action")
+"""A video generator, another trainable model, and one of two experts: what hardly differs between families is tried on
+these for every change."""
+
+
+@pytest.mark.parametrize("name", with_nightly(NAMES, EVERY_KIND))
 def test_the_loss_falls_on_four_clips_learnt_by_heart(name: str, data: Path, weights: Any) -> None:
     """Measured on the same noise before and after."""
     trainer = make_trainer(name, data, weights(name), epochs=STEPS[name], drop=0.0, checkpointing=False)
@@ -100,7 +105,7 @@ def test_the_first_frame_is_given_and_out_of_the_loss(name: str, data: Path, wei
     assert (measure() - before).abs().min() > 1e-6  # the denoiser sees the one that is given
 
 
-@pytest.mark.parametrize("name", NAMES)
+@pytest.mark.parametrize("name", with_nightly(NAMES, EVERY_KIND))
 def test_each_recipe_resumes_exactly(name: str, data: Path, weights: Any) -> None:
     """From the middle; where there are two experts, from the middle of the second."""
     changes = {"epochs": 4, "batch": 4, "rows": 4}
@@ -152,7 +157,7 @@ def test_each_expert_is_trained_on_its_side_of_the_boundary(data: Path, weights:
     assert moved and not any("transformer_2" in key for key in moved)
 
 
-@pytest.mark.parametrize("name", NAMES)
+@pytest.mark.parametrize("name", with_nightly(NAMES, EVERY_KIND))
 def test_half_precision_trains_weights_in_float32(name: str, data: Path, weights: Any) -> None:
     trainer = make_trainer(name, data, weights(name), precision="bfloat16")
     assert np.isfinite(trainer.train_step(1e-3)) and np.isfinite(trainer.train_step(1e-3))
@@ -347,6 +352,7 @@ def test_a_checkpoint_runs_as_a_world_model(name: str, data: Path, weights: Any,
 
 # -- resuming ----------------------------------------------------------------------------------------------------------
 
+EPOCHS = 6
 VICTIM = """
 import sys, os, signal, torch
 sys.path[:0] = {path!r}
@@ -360,7 +366,7 @@ def on_step(step, steps, loss):
     print(step, flush=True)
     if step == stop:
         os.kill(os.getpid(), number)
-recipe = tiny_recipe({name!r}, epochs=20)
+recipe = tiny_recipe({name!r}, epochs={epochs})
 options = dict(weights={weights!r}, device="cpu", recipe=recipe, part="all", seconds=0, on_step=on_step)
 post_train({name!r}, {data!r}, {out!r}, **options)
 """
@@ -369,7 +375,14 @@ post_train({name!r}, {data!r}, {out!r}, **options)
 def _run(name: str, data: Path, weights: Path, out: Path, stop: int, number: int) -> subprocess.CompletedProcess[str]:
     path = [str(Path(__file__).parent), str(Path(__file__).parents[1])]
     script = VICTIM.format(
-        path=path, name=name, data=str(data), out=str(out), weights=str(weights), stop=stop, number=int(number)
+        path=path,
+        name=name,
+        epochs=EPOCHS,
+        data=str(data),
+        out=str(out),
+        weights=str(weights),
+        stop=stop,
+        number=int(number),
     )
     return subprocess.run([sys.executable, "-c", script], capture_output=True, text=True, timeout=300, check=False)
 
@@ -377,13 +390,13 @@ def _run(name: str, data: Path, weights: Path, out: Path, stop: int, number: int
 def test_a_killed_training_ends_with_the_same_bytes(data: Path, weights: Any, tmp_path: Path) -> None:
     name = "ltx-action"
     options: dict[str, Any] = {"weights": weights(name), "device": "cpu", "part": "all"}
-    recipe = tiny_recipe(name, epochs=20)
+    recipe = tiny_recipe(name, epochs=EPOCHS)
     post_train(name, data, tmp_path / "whole", recipe=recipe, **options)
-    killed = _run(name, data, weights(name), tmp_path / "killed", 11, signal.SIGKILL)
-    assert killed.returncode == -signal.SIGKILL and killed.stdout.split()[-1] == "11", killed.stderr
+    killed = _run(name, data, weights(name), tmp_path / "killed", 4, signal.SIGKILL)
+    assert killed.returncode == -signal.SIGKILL and killed.stdout.split()[-1] == "4", killed.stderr
     steps: list[int] = []
     post_train(name, data, tmp_path / "killed", recipe=recipe, on_step=lambda step, *_: steps.append(step), **options)
-    assert steps == list(range(11, 21))  # the state after step 10 was the last on disk
+    assert steps == list(range(4, EPOCHS + 1))  # the state after step 3 was the last on disk
     assert contents(tmp_path / "whole") == contents(tmp_path / "killed")
     assert not list(tmp_path.glob("*.checkpoint"))
 
@@ -404,7 +417,7 @@ run_process()
 def test_sigterm_writes_the_state_and_other_numbers_do_not_resume(data: Path, weights: Any, tmp_path: Path) -> None:
     """As a batch system stops the command."""
     name, out = "ltx-action", tmp_path / "out"
-    numbers = ["frames=9", "size=[64, 128]", "batch=4", "clips=4", "epochs=20"]
+    numbers = ["frames=9", "size=[64, 128]", "batch=4", "clips=4", "epochs=5"]
     command = ["train", name, "--data", str(data), "--weights", str(weights(name)), "--part", "all", "--out", str(out)]
     command += [each for number in numbers for each in ("--option", number)]
     ended = subprocess.run(
@@ -414,7 +427,7 @@ def test_sigterm_writes_the_state_and_other_numbers_do_not_resume(data: Path, we
     assert torch.load(tmp_path / "out.checkpoint", weights_only=True)["step"] == 3 and not out.exists()
     options: dict[str, Any] = {"weights": weights(name), "device": "cpu", "part": "all"}
     with pytest.raises(ArgumentError, match="other data or options"):
-        post_train(name, data, out, recipe=tiny_recipe(name, epochs=20, seed=1), **options)
+        post_train(name, data, out, recipe=tiny_recipe(name, epochs=5, seed=1), **options)
 
 
 def test_sigusr1_writes_the_state_and_goes_on(data: Path, weights: Any, tmp_path: Path) -> None:

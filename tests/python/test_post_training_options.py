@@ -19,7 +19,7 @@ pytest.importorskip("peft", reason="no peft: pip install 'wiw[diffusers]'")
 pytest.importorskip("pyarrow", reason="no pyarrow: pip install 'wiw[export]'")
 
 import torch
-from post_training_parts import make_trainer, save_dataset, save_stock, tiny_recipe
+from post_training_parts import make_trainer, save_dataset, save_stock, tiny_recipe, with_nightly
 from safetensors.torch import load_file
 
 from wiw.training.post_training.latent_cache import LatentCache
@@ -98,7 +98,7 @@ def test_the_checkpoint_has_the_averages_and_training_goes_on_with_the_weights(
     assert all(torch.equal(value, weights_before[name]) for name, value in twin.trained.items())
 
 
-@pytest.mark.parametrize("name", NAMES)
+@pytest.mark.parametrize("name", with_nightly(NAMES, ("ltx-action", "nwm-action")))
 def test_a_cache_changes_nothing_but_is_read(
     name: str, data: Path, weights: Any, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

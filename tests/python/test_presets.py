@@ -11,6 +11,7 @@ import pytest
 import wiw
 from wiw.cli import main
 from wiw.errors import ArgumentError, FileError, StoreError
+from wiw.mapping_files import read_yaml_mapping
 from wiw.runs.recipes import AgentRecipe
 from wiw.studies.evaluate import evaluate, resume_run
 from wiw.tasks import presets
@@ -42,6 +43,14 @@ def test_shipped_presets_hold_the_published_rules() -> None:
     assert asdict(ImageNav(preset="official").rules) == OFFICIAL
     assert ImageNav(preset="official").budget == 21 * 3
     assert ImageNav(preset="official", radius=1).rules.radius == 1.0
+
+
+def test_what_a_reader_changes_is_not_what_the_next_one_reads(tmp_path: Path) -> None:
+    own = write_preset(tmp_path, "generator: {near: 1}")
+    read_yaml_mapping(own, "rules")["generator"]["near"] = 2
+    assert read_yaml_mapping(own, "rules") == {"generator": {"near": 1}}
+    write_preset(tmp_path, "generator: {near: 3}")
+    assert read_yaml_mapping(own, "rules") == {"generator": {"near": 3}}
 
 
 def test_they_lie_inside_the_package_and_are_shown_at_the_root() -> None:

@@ -199,15 +199,23 @@ def test_turns_and_the_order_of_steering_cost_a_plan(two_rooms: str, tmp_path: P
     assert scores[1] - scores[2] == pytest.approx(0.05)
 
 
+def test_weights_that_come_with_the_package_are_small_and_calibrated() -> None:
+    from wiw.perception.recogniser import Recogniser
+    from wiw.policies.recogniser import WEIGHTS
+
+    recogniser = Recogniser.load(WEIGHTS)
+    assert WEIGHTS.stat().st_size < 2 * 2**20
+    assert recogniser.card["accuracy"]["start + 3 real"] > recogniser.card["accuracy"]["start"] > 0.75
+    assert recogniser.card["calibration_error"]["after"] < 0.05
+
+
+@pytest.mark.nightly
 def test_weights_that_come_with_the_package_know_things_of_unseen_homes() -> None:
     from wiw.perception.recogniser import Recogniser
     from wiw.policies.recogniser import WEIGHTS
     from wiw.training.glimpse_sets import START, GlimpseSetRules, collect_glimpse_sets
 
     recogniser = Recogniser.load(WEIGHTS)
-    assert WEIGHTS.stat().st_size < 2 * 2**20
-    assert recogniser.card["accuracy"]["start + 3 real"] > recogniser.card["accuracy"]["start"] > 0.75
-    assert recogniser.card["calibration_error"]["after"] < 0.05
     looks = collect_glimpse_sets(world("apartments:test/900"), 0, recogniser.categories, GlimpseSetRules(places=6))
     first = [looks.glimpses[np.array([row])] for row in np.flatnonzero(looks.kinds == START)]
     right = recogniser(first).argmax(axis=1) == looks.labels

@@ -170,11 +170,11 @@ def test_the_command_makes_a_model(
     monkeypatch.setattr("wiw.training.plays.PLAYS_PER_FILE", 4)
     monkeypatch.setattr("wiw.training.armnet.Recipe", partial(Recipe, widths=SMALL, rate=5e-3))
     out, cache = tmp_path / "weights.safetensors", tmp_path / "plays"
-    command = ["train", "armnet", "--plays", "8", "--epochs", "8", "--out", str(out), "--cache", str(cache)]
+    command = ["train", "armnet", "--plays", "4", "--epochs", "12", "--out", str(out), "--cache", str(cache)]
     assert main([*command, "--workers", "1"]) == 0
     assert "poses ahead" in capsys.readouterr().out
     card = ArmNet(out).card
-    assert card["plays"] == 8 and card["recipe"]["epochs"] == 8
+    assert card["plays"] == 4 and card["recipe"]["epochs"] == 12
     held_out = gather_plays(4, HELD_OUT_SEED_OFFSET, cache, 1, lambda items, text, total: items)
     torch.manual_seed(0)
     untrained = evaluate(Network(SMALL).eval(), held_out)["changed"]

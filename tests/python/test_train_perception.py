@@ -286,6 +286,8 @@ def test_the_command_trains_on_apartments(
 ) -> None:
     monkeypatch.setattr("wiw.training.perception.Recipe", partial(Recipe, widths=(16, 24, 32, 48), rate=5e-3))
     monkeypatch.setattr("wiw.training.color_naming.calibrate", partial(color_naming.calibrate, steps=300))
+    others = {"apartments:train/0": "apartments:val/1", "apartments:val/0": "apartments:val/3"}
+    monkeypatch.setattr("wiw.training.gather.change_states", lambda scene, seed: others[scene])  # need no new light
     out, cache = tmp_path / "weights.safetensors", tmp_path / "looks"
     command = ["train", "perception", "--scenes", "apartments:train:1", "--val", "apartments:val:1", "--places", "2"]
     assert main([*command, "--out", str(out), "--cache", str(cache), "--workers", "1", "--epochs", "4"]) == 0

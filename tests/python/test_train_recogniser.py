@@ -73,7 +73,7 @@ def lesson() -> Any:
     from wiw.training.recogniser import Recipe, calibrate, train
 
     recipe = Recipe(
-        epochs=12, batch=24, width=8, seed=3, recolor=0, transplant=0, degrade=0
+        epochs=7, batch=24, width=8, seed=3, recolor=0, transplant=0, degrade=0
     )  # here colour tells what misleads
     network, used = train(made_up(240, 0), NAMES, recipe)
     assert used == recipe

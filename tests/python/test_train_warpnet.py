@@ -92,7 +92,7 @@ def test_the_command_makes_a_model_that_beats_the_floor(
     monkeypatch.setattr("wiw.training.warpnet.Recipe", partial(Recipe, widths=(8, 16, 16)))
     monkeypatch.setattr("wiw.training.warpnet.evaluate", partial(evaluate, paths=1))
     out, cache = tmp_path / "weights.safetensors", tmp_path / "looks"
-    command = ["train", "warpnet", "--scenes", "apartments:train:2", "--val", "apartments:val:1", "--places", "10"]
+    command = ["train", "warpnet", "--scenes", "apartments:train:1", "--val", "apartments:val:1", "--places", "20"]
     options = ["--out", str(out), "--cache", str(cache), "--workers", "1"]
     assert main([*command, *options, "--epochs", "3"]) == 0
     assert "steps of 0.2 m ahead" in capsys.readouterr().out
@@ -100,9 +100,9 @@ def test_the_command_makes_a_model_that_beats_the_floor(
     psnr = model.card["held_out"]["psnr"]
     assert psnr["warpnet"]["3"] > psnr["copy"]["3"] + 2
     assert psnr["warp"]["3"] > psnr["warpnet"]["3"]
-    assert model.card["scenes"] == "apartments:train:2"
+    assert model.card["scenes"] == "apartments:train:1"
     assert model.card["recipe"]["epochs"] == 3
-    assert [file.suffix for file in sorted(cache.iterdir())] == [".npz"] * 2
+    assert [file.suffix for file in cache.iterdir()] == [".npz"]
 
     before = {file: file.stat().st_mtime_ns for file in cache.iterdir()}
     assert main([*command, *options, "--epochs", "1"]) == 0

@@ -64,12 +64,13 @@ def _render_within(run: Run, episodes: int | None, max_mb: float, remark: str) -
     def fits(page: str) -> bool:
         return len(page.encode()) <= max_mb * 10**6
 
-    pictured = len(choose_pictured_episodes(run.store))
+    findings, pictured = _gather_findings(run), len(choose_pictured_episodes(run.store))
     for count in range(pictured if episodes is None else min(episodes, pictured), 0, -1):
-        smallest = render(run, count, SCALES[-1], remark)
+        smallest = _render_page(run, findings, count, SCALES[-1], remark)
         if fits(smallest):
-            return next(filter(fits, (render(run, count, scale, remark) for scale in SCALES[:-1])), smallest)
-    bare = render(run, 0, remark=remark)
+            larger = (_render_page(run, findings, count, scale, remark) for scale in SCALES[:-1])
+            return next(filter(fits, larger), smallest)
+    bare = _render_page(run, findings, 0, 1.0, remark)
     if not fits(bare):
         size = len(bare.encode()) / 10**6
         raise ArgumentError(
@@ -87,47 +88,48 @@ def render(run: Run, episodes: int | None = None, scale: float = 1.0, remark: st
         scale: of the pictures of decisions.
         remark: sentence that the page shows below the result.
     """
-    summary, config, info = summarise_run(run), run.store.config, run.store.info
+    return _render_page(run, _gather_findings(run), episodes, scale, remark)
+
+
+def _render_page(run: Run, findings: Mapping[str, Any], episodes: int | None, scale: float, remark: str) -> str:
+    """Return the page with the findings, the episodes asked for and their pictures in this scale."""
     album = Album(scale)
     shown, maps = read_stories(run.store, run.arms, album, episodes)
+    values = {"whole": Album.whole, "remark": remark, "stories": shown, "maps": maps, "pictures": album.pictures}
+    return environment().get_template("page.html.j2").render(**findings, **values)
+
+
+def _gather_findings(run: Run) -> dict[str, Any]:
+    """Return what the page shows whichever episodes have pictures: tables, plots and configuration."""
+    summary, config, info = summarise_run(run), run.store.config, run.store.info
     truths, ledger, blamed = fidelity(run), costs(run), read_blame(run.store)
     measured, paid = choose_columns(truths), cost_columns(ledger)
-    return (
-        environment()
-        .get_template("page.html.j2")
-        .render(
-            **_common(summary),
-            title=title(run),
-            task=config["task"],
-            created=run.store.created,
-            version=f"{run.store.wiw_version}, benchmark {run.store.benchmark}",
-            words=wording(run.store),
-            whole=Album.whole,
-            remark=remark,
-            sentence="" if summary.tiers else sentence(summary, wording(run.store)),
-            tiers=[
-                {**tier, "sentence": sentence(tier["summary"], wording(run.store))} for tier in _list_tiers(summary)
-            ],
-            terms=explain_metrics(summary, wording(run.store)),
-            plots=_plots(run, summary, truths, blamed),
-            stories=shown,
-            maps=maps,
-            pictures=album.pictures,
-            costs=[(line, line.cells()[: len(paid)]) for line in ledger],
-            cost_columns=paid,
-            fidelity=[(line, line.cells(measured)) for line in truths],
-            fidelity_columns=[(column.title, column.about) for column in measured],
-            blame=blamed.arms if blamed else (),
-            reruns=blamed.scheme.reruns if blamed else {},
-            verdicts=blamed.scheme.verdicts if blamed else {},
-            blame_notes=blamed.notes() if blamed else [],
-            errors=[row for row in run.episodes if row["status"] == "error"],
-            radius=config["task"].get("radius"),
-            config=json.dumps(config, indent=2, ensure_ascii=False),
-            platform=json.dumps(info["platform"], indent=2, ensure_ascii=False),
-            command=" ".join(info["command"]),
-        )
-    )
+    words = wording(run.store)
+    return {
+        **_common(summary),
+        "title": title(run),
+        "task": config["task"],
+        "created": run.store.created,
+        "version": f"{run.store.wiw_version}, benchmark {run.store.benchmark}",
+        "words": words,
+        "sentence": "" if summary.tiers else sentence(summary, words),
+        "tiers": [{**tier, "sentence": sentence(tier["summary"], words)} for tier in _list_tiers(summary)],
+        "terms": explain_metrics(summary, words),
+        "plots": _plots(run, summary, truths, blamed),
+        "costs": [(line, line.cells()[: len(paid)]) for line in ledger],
+        "cost_columns": paid,
+        "fidelity": [(line, line.cells(measured)) for line in truths],
+        "fidelity_columns": [(column.title, column.about) for column in measured],
+        "blame": blamed.arms if blamed else (),
+        "reruns": blamed.scheme.reruns if blamed else {},
+        "verdicts": blamed.scheme.verdicts if blamed else {},
+        "blame_notes": blamed.notes() if blamed else [],
+        "errors": [row for row in run.episodes if row["status"] == "error"],
+        "radius": config["task"].get("radius"),
+        "config": json.dumps(config, indent=2, ensure_ascii=False),
+        "platform": json.dumps(info["platform"], indent=2, ensure_ascii=False),
+        "command": " ".join(info["command"]),
+    }
 
 
 def summary_html(summary: Summary) -> str:

@@ -3,6 +3,7 @@
 
 from __future__ import annotations
 
+import sys
 import time
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
@@ -265,8 +266,8 @@ def make_board(wanted: bool) -> Board:
 
 def in_notebook() -> bool:
     """Return whether the value of a cell is shown by itself, so that printing it would show it twice."""
-    try:
-        from IPython import get_ipython
-    except ModuleNotFoundError:
+    if "IPython" not in sys.modules:  # a notebook has it loaded, and elsewhere loading it takes longer than a short run
         return False
+    from IPython import get_ipython
+
     return type(get_ipython()).__name__ == "ZMQInteractiveShell"
