@@ -9,6 +9,7 @@ from pathlib import Path
 from typing import Any
 
 import pytest
+import yaml
 
 import wiw
 from wiw.cli.app import main
@@ -71,6 +72,32 @@ def test_a_study_runs_resumes_and_draws_its_page(own: Path, tmp_path: Path, caps
     with pytest.raises(StoreError, match="episodes"):
         wiw.study(own, out=out, variables={"episodes": 1}, progress=False)
     assert (out / "study.yaml").read_text() == plan, "it says what was run"
+
+
+def test_a_study_that_was_begun_may_gain_arms_and_nothing_else(own: Path, tmp_path: Path) -> None:
+    own.write_text(own.read_text().replace("seed: 3", "seed: 3, salt: pepper").replace("[left-out, front]", ""))
+    content = yaml.safe_load(own.read_text())
+    arms = content["runs"]["here"]["arms"]
+
+    def run(out: str, *names: str, **changes: Any) -> dict[tuple[str, int], Any]:
+        content["runs"]["here"]["arms"] = {name: {**arms[name], **changes} for name in names}
+        content["runs"]["here"]["compare"] = []
+        own.write_text(yaml.safe_dump(content, sort_keys=False))
+        wiw.study(own, out=tmp_path / out, variables={"episodes": 1}, progress=False)
+        log = wiw.load_run(tmp_path / out / "here")
+        return {(row["arm"], row["episode"]): (row["metrics"], row["seconds"]) for row in log.episodes}
+
+    few = run("grown", "none", "around")
+    grown, whole = run("grown", "none", "front", "around"), run("whole", "none", "front", "around")
+    assert few.items() <= grown.items(), "what has been run stays"
+    assert list(grown) == list(whole) and {arm for arm, _ in grown} == {"none", "front", "around"}
+    assert [metrics for metrics, _ in grown.values()] == [metrics for metrics, _ in whole.values()]
+    log = wiw.load_run(tmp_path / "grown" / "here")
+    assert log.arms == ["none", "front", "around"]
+    assert [each["arms"] for each in log.store.info["arms_added"]] == [["front"]]
+    for names, changes in ((("none", "front"), {}), (("none", "front", "around"), {"candidates": 3})):
+        with pytest.raises(StoreError, match=r"run of another configuration \(arms: the run has"):
+            run("grown", *names, **changes)
 
 
 def test_variables_are_filled_in_and_arms_are_merged(own: Path) -> None:
