@@ -229,8 +229,8 @@ def test_a_task_takes_options(tmp_path, two_rooms, short, capsys):
     assert (said["radius"], said["spl"], log.episodes[0]["metrics"]["success"]) == (9.0, "actions", 1.0)
     assert main(["resume", str(tmp_path / "run"), "--no-report"]) == 0
     for wrong, message in (
-        ("radius=wide", "radius: expected a value of type float"),
-        ("radios=9", "unknown rules radios"),
+        ("radius=wide", "radius: expected a number"),
+        ("radios=9", "unknown rule 'radios'"),
         ("seed=3", "--seed"),
         ("radius", "KEY=VALUE"),
     ):

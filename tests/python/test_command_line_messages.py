@@ -58,7 +58,7 @@ def test_list_takes_a_kind(what: str, names: list[str], others: list[str], capsy
     ("arguments", "message"),
     [
         (["--policy-option", "a=b"], "policy matcher: unknown option 'a'; there are histogram,"),
-        (["--policy-option", "turn=left"], "policy matcher: expected a number for turn, got 'left'"),
+        (["--policy-option", "turn=left"], "policy matcher: turn: expected a number, got 'left'"),
         (["--width", "2"], "give --depth 2 or more"),
         (["--policy", "recogniser"], "use it with task ar"),
         (["--scenes", "apartment:val:1"], "wiw: apartment:val:1: no such file"),

@@ -439,7 +439,7 @@ def test_what_the_policy_needs_is_asked_for_in_words(situate: Any) -> None:
         policy.begin(Goal("ar", choices=("chair",)), Key(0, 0))
     with pytest.raises(ArgumentError, match="unknown option 'depth'"):
         tiny_policy(depth=3)
-    with pytest.raises(ArgumentError, match="expected a number for doubt, got 'much'"):
+    with pytest.raises(ArgumentError, match="doubt: expected a number, got 'much'"):
         tiny_policy(doubt="much")
     for out_of_range in ({"patience": 0}, {"spacing": -1}, {"targets": 0}, {"doubt": 1}, {"commitment": 2}):
         with pytest.raises(ArgumentError, match=r"policy navigator: expected (patience|doubt)"):

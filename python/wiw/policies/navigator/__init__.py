@@ -28,7 +28,7 @@ from wiw.policies.navigator.candidates import Candidate, choose_apart, list_cand
 from wiw.policies.navigator.estimator import GoalEstimator, require_torch
 from wiw.policies.navigator.way_cells import WayCells
 from wiw.policies.navigator.ways import WayMap, Ways
-from wiw.policies.options import read_numbers
+from wiw.typed_values import read_values
 from wiw.types import Goal, Key, Proposal, Rollout
 
 if TYPE_CHECKING:
@@ -138,7 +138,7 @@ class Navigator(Policy):
         require_torch()
         from wiw.policies.navigator.weights import load
 
-        self.options = read_numbers("navigator", NavigatorOptions, options)
+        self.options = NavigatorOptions(**read_values(NavigatorOptions, options, "policy navigator", "option"))
         file = Path(WEIGHTS if weights is None else weights).expanduser()
         self._use_network(*load(file), blake2b(file.read_bytes(), digest_size=8).hexdigest())
 
@@ -146,7 +146,7 @@ class Navigator(Policy):
     def from_network(cls, network: Network, card: dict[str, Any], **options: Any) -> Navigator:
         """Make the policy of a network in memory, such as one in training; `card` has what `measure_prior` returns."""
         policy = cls.__new__(cls)
-        policy.options = read_numbers("navigator", NavigatorOptions, options)
+        policy.options = NavigatorOptions(**read_values(NavigatorOptions, options, "policy navigator", "option"))
         policy._use_network(network, card, "")
         return policy
 
