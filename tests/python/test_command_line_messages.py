@@ -86,7 +86,9 @@ def test_facts_of_scenes_are_whole_in_80_columns(
     two_rooms: str, tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setenv("COLUMNS", "80")
-    monkeypatch.setattr("wiw.cli.scenes._facts", lambda _: ["a" * 40, "10.5 x 12.2 x 2.6", "1,108,123", *["1234"] * 5])
+    monkeypatch.setattr(
+        "wiw.cli.scenes._list_facts", lambda _: ["a" * 40, "10.5 x 12.2 x 2.6", "1,108,123", *["1234"] * 5]
+    )
     assert main(["scenes", two_rooms, "--views", "1", "--out", str(tmp_path / "sheet.png")]) == 0
     shown = capsys.readouterr().out
     assert "…" not in shown and max(map(len, shown.splitlines()[:4])) <= 80

@@ -70,10 +70,10 @@ def load_preset(task: str, preset: str | Path) -> Preset:
     models: dict[str, dict[str, Any]] = {}
     reasons: dict[str, dict[str, Any]] = {}
     policy: str | None = None
-    for path in _chain(task, preset):
+    for path in _list_files(task, preset):
         content = _read(path)
         policy = _read_policy(content, path) or policy
-        rules |= _without_header(content)
+        rules |= _drop_header(content)
         generator |= _read_generator_rules(content, path)
         _add_options(policies, _read_options(content, "policies", path))
         _add_options(models, _read_options(content, "models", path))
@@ -116,8 +116,8 @@ def load_rules(cls: type[Rules], task: str, preset: str | Path, overrides: Mappi
         FileError: the file cannot be read, or does not hold a mapping.
     """
     values: dict[str, Any] = {}
-    for path in _chain(task, preset):
-        values |= read_values(cls, _without_header(_read(path)), str(path), "rule")
+    for path in _list_files(task, preset):
+        values |= read_values(cls, _drop_header(_read(path)), str(path), "rule")
     values |= read_values(cls, overrides, f"options of {task}", "rule")
     missing = [field.name for field in _open_fields(cls) if field.name not in values]
     if missing:
@@ -136,7 +136,7 @@ def _open_fields(cls: type) -> list[Field[Any]]:
     return [field for field in fields(cls) if field.default is MISSING and field.default_factory is MISSING]
 
 
-def _chain(task: str, preset: str | Path) -> list[Path]:
+def _list_files(task: str, preset: str | Path) -> list[Path]:
     """Return the files of a preset, what it is based on first."""
     path = _find(task, preset)
     if path is None:
@@ -149,7 +149,7 @@ def _chain(task: str, preset: str | Path) -> list[Path]:
         raise ArgumentError(
             f"{path}: base '{base}' is not one of {', '.join(shipped) or '(none)'}.{did_you_mean(str(base), shipped)}"
         )
-    return [*_chain(task, base), path]
+    return [*_list_files(task, base), path]
 
 
 def _find(task: str, preset: str | Path) -> Path | None:
@@ -172,7 +172,7 @@ def _read(path: Path) -> Mapping[str, Any]:
     return read_yaml_mapping(path, "rules as `name: value` lines")
 
 
-def _without_header(content: Mapping[str, Any]) -> dict[str, Any]:
+def _drop_header(content: Mapping[str, Any]) -> dict[str, Any]:
     return {name: value for name, value in content.items() if name not in HEADER}
 
 
