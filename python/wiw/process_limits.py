@@ -44,7 +44,10 @@ def find_memory_limit() -> int:
 
 
 def limit_memory() -> int:
-    """Let this process take three quarters of the machine's or the container's memory; return that in bytes."""
+    """Let this process take three quarters of the machine's or the container's memory; return that in bytes.
+
+    The kernel counts each process by itself: those that this one starts may take as much each.
+    """
     most = find_memory_limit()
     _, hard = resource.getrlimit(resource.RLIMIT_DATA)
     most = most if hard == resource.RLIM_INFINITY else min(most, hard)

@@ -51,7 +51,7 @@ class ChildProcess:
 
     Args:
         memory_gb: most gigabytes of memory that it may take, looked at while it computes; None means three quarters of
-            the machine's.
+            the machine's. Processes that it starts are not counted: after a fork they seem to take what they share.
     """
 
     def __init__(self, memory_gb: float | None = None) -> None:
@@ -187,7 +187,8 @@ class ChildProcess:
     def _await_reply(self, until: float | None) -> None:
         """Wait for the begin of a reply, with a look at the child's memory now and then.
 
-        A limit of the kernel's would also count what the driver of a GPU merely reserves.
+        A limit of the kernel's would also count what the driver of a GPU merely reserves. Neither counts what the
+        child's own children take.
 
         Raises:
             TimeoutError: there is none in time.
