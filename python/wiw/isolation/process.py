@@ -30,13 +30,12 @@ import msgpack
 import numpy as np
 from numpy.typing import NDArray
 
-import wiw
 from wiw import errors
 from wiw.errors import InfrastructureError
 from wiw.isolation.connection import receive, send
 from wiw.isolation.failures import EndedError, ExitError, LateError, RaisedError
 from wiw.isolation.segments import Segment, SegmentPool, place
-from wiw.process_limits import find_memory_limit
+from wiw.process_limits import find_memory_limit, make_child_environment
 
 STARTING = 120.0
 """Seconds in which a child has to be there; it takes half of one on an idle machine."""
@@ -250,15 +249,8 @@ def _open(command: list[str], descriptor: int) -> subprocess.Popen[bytes]:
         stdout=2,
         pass_fds=(descriptor,),
         start_new_session=True,
-        env=_environment(),
+        env=make_child_environment(),
     )
-
-
-def _environment() -> dict[str, str]:
-    """Return our own environment, with this very package first on the child's path."""
-    here = str(Path(wiw.__file__).parents[1])
-    paths = [here, *filter(None, os.environ.get("PYTHONPATH", "").split(os.pathsep))]
-    return {**os.environ, "PYTHONPATH": os.pathsep.join(paths)}
 
 
 def _end(process: subprocess.Popen[bytes], connection: socket.socket) -> None:
