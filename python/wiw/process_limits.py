@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Limits of child processes: they end with their parent, and take so much time and memory."""
+"""Child processes: their environment, their end with that of their parent, and limits of time and memory."""
 
 from __future__ import annotations
 
@@ -14,6 +14,13 @@ from pathlib import Path
 
 _PR_SET_PDEATHSIG = 1
 _CGROUPS = ("/sys/fs/cgroup/memory.max", "/sys/fs/cgroup/memory/memory.limit_in_bytes")
+
+
+def make_child_environment() -> dict[str, str]:
+    """Return our own environment, with this very package first on the child's path."""
+    here = str(Path(__file__).parents[1])
+    paths = [here, *filter(None, os.environ.get("PYTHONPATH", "").split(os.pathsep))]
+    return {**os.environ, "PYTHONPATH": os.pathsep.join(paths)}
 
 
 def end_with_parent(parent: int) -> None:
@@ -44,7 +51,10 @@ def find_memory_limit() -> int:
 
 
 def limit_memory() -> int:
-    """Let this process take three quarters of the machine's or the container's memory; return that in bytes."""
+    """Let this process take three quarters of the machine's or the container's memory; return that in bytes.
+
+    The kernel counts each process by itself: those that this one starts may take as much each.
+    """
     most = find_memory_limit()
     _, hard = resource.getrlimit(resource.RLIMIT_DATA)
     most = most if hard == resource.RLIM_INFINITY else min(most, hard)

@@ -51,7 +51,7 @@ class Registry:
 
     def names(self) -> list[str]:
         """Return all registered names, built-in ones first."""
-        return [*self.built_in, *sorted(({*self._plugins(), *self.registered}) - set(self.built_in))]
+        return [*self.built_in, *sorted(({*self._list_plugins(), *self.registered}) - set(self.built_in))]
 
     def register(self, name: str, thing: Any) -> None:
         """Add a class or factory under a name, in this process.
@@ -78,7 +78,7 @@ class Registry:
         """Return whether a name stands for code in a file or package that does not ship with wiw."""
         if name in self.registered or name in self.built_in or name.partition(":")[0] + ":" in self.built_in:
             return False
-        plugins = self._plugins()
+        plugins = self._list_plugins()
         path = plugins[name].value if name in plugins else name
         return ":" in path and path.partition(":")[0].partition(".")[0] != "wiw"
 
@@ -88,7 +88,7 @@ class Registry:
             return self.registered[name]
         if name in self.built_in:
             return self._load(name, partial(_attribute, self.built_in[name]))
-        plugins = self._plugins()
+        plugins = self._list_plugins()
         if name in plugins:
             return self._load(name, plugins[name].load)
         prefix, colon, argument = name.partition(":")
@@ -146,10 +146,10 @@ class Registry:
                 raise
             name = what if isinstance(what, str) else getattr(what, "__qualname__", repr(what))
             raise ConstructionError(
-                f"{self.kind} '{name}' cannot be made: {type(error).__name__}: {error}{_where(error)}"
+                f"{self.kind} '{name}' cannot be made: {type(error).__name__}: {error}{_locate_error(error)}"
             ) from error
 
-    def _plugins(self) -> dict[str, Any]:
+    def _list_plugins(self) -> dict[str, Any]:
         return {point.name: point for point in entry_points(group=self.group)} if self.group else {}
 
     def _load(self, name: str, load: Callable[[], Any]) -> Any:
@@ -159,7 +159,7 @@ class Registry:
             if is_stop_request(error):
                 raise
             raise RegistryError(
-                f"{self.kind} '{name}' cannot be loaded: {type(error).__name__}: {error}{_where(error)}"
+                f"{self.kind} '{name}' cannot be loaded: {type(error).__name__}: {error}{_locate_error(error)}"
             ) from error
         return self._check_kind(name, found) if inspect.isclass(found) else found
 
@@ -217,7 +217,7 @@ def _import_file(path: Path) -> Any:
     return module
 
 
-def _where(error: BaseException) -> str:
+def _locate_error(error: BaseException) -> str:
     """Return, e.g., " (model.py, line 3)": where an import failed, as the message alone may not say."""
     if isinstance(error, SyntaxError | FileNotFoundError | AttributeError) or error.__traceback__ is None:
         return ""
@@ -418,7 +418,7 @@ def make(task_id: str, depth: bool = True, **options: Any) -> Any:
     Raises:
         RegistryError: unknown task, or options that do not fit; the message says what is known.
     """
-    task, own = _task(task_id, options)
+    task, own = _make_task(task_id, options)
     return task.environment(depth=depth, **own)
 
 
@@ -429,11 +429,11 @@ def make_vec(task_id: str, num_envs: int, depth: bool = True, **options: Any) ->
         RegistryError: unknown task, or options that do not fit; the message says what is known.
         ArgumentError: `num_envs` below 1.
     """
-    task, own = _task(task_id, options)
+    task, own = _make_task(task_id, options)
     return task.vector_environment(num_envs, depth=depth, **own)
 
 
-def _task(task_id: str, options: dict[str, Any]) -> tuple[Any, dict[str, Any]]:
+def _make_task(task_id: str, options: dict[str, Any]) -> tuple[Any, dict[str, Any]]:
     """Return the task, and the options that belong to its environments."""
     name = task_name(task_id)
     sensors = task_class(name).sensor_options

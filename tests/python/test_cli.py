@@ -229,8 +229,8 @@ def test_a_task_takes_options(tmp_path, two_rooms, short, capsys):
     assert (said["radius"], said["spl"], log.episodes[0]["metrics"]["success"]) == (9.0, "actions", 1.0)
     assert main(["resume", str(tmp_path / "run"), "--no-report"]) == 0
     for wrong, message in (
-        ("radius=wide", "radius: expected a value of type float"),
-        ("radios=9", "unknown rules radios"),
+        ("radius=wide", "radius: expected a number"),
+        ("radios=9", "unknown rule 'radios'"),
         ("seed=3", "--seed"),
         ("radius", "KEY=VALUE"),
     ):
@@ -380,7 +380,7 @@ def test_doctor_warns_with_a_remedy(monkeypatch, tmp_path):
 
 def test_doctor_says_where_scenes_are_kept_and_how_big_they_are(monkeypatch, tmp_path):
     monkeypatch.setenv("WIW_CACHE", str(tmp_path / "cache"))
-    monkeypatch.setattr("wiw.cli.doctor._free_gigabytes", lambda folder: 20.0)  # however full the disk is
+    monkeypatch.setattr("wiw.cli.doctor._count_free_gigabytes", lambda folder: 20.0)  # however full the disk is
     found = {finding.name: finding for finding in examine()}["scene cache"]
     assert str(tmp_path / "cache" / "scenes") in found.detail and "0 files, 0 MB" in found.detail and not found.remedy
     monkeypatch.setenv("WIW_CACHE_GB", "0.5")
@@ -388,7 +388,7 @@ def test_doctor_says_where_scenes_are_kept_and_how_big_they_are(monkeypatch, tmp
     (tmp_path / "cache" / "scenes").mkdir(parents=True)
     (tmp_path / "cache" / "scenes" / "a.wiwscene").write_bytes(bytes(3 << 20))
     assert "1 files, 3 MB" in {finding.name: finding for finding in examine()}["scene cache"].detail
-    monkeypatch.setattr("wiw.cli.doctor._free_gigabytes", lambda folder: 0.5)
+    monkeypatch.setattr("wiw.cli.doctor._count_free_gigabytes", lambda folder: 0.5)
     assert "nearly full" in {finding.name: finding for finding in examine()}["scene cache"].remedy
     monkeypatch.setattr(os, "access", lambda *_: False)
     assert "set WIW_CACHE" in {finding.name: finding for finding in examine()}["scene cache"].remedy

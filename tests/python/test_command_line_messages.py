@@ -58,7 +58,7 @@ def test_list_takes_a_kind(what: str, names: list[str], others: list[str], capsy
     ("arguments", "message"),
     [
         (["--policy-option", "a=b"], "policy matcher: unknown option 'a'; there are histogram,"),
-        (["--policy-option", "turn=left"], "policy matcher: expected a number for turn, got 'left'"),
+        (["--policy-option", "turn=left"], "policy matcher: turn: expected a number, got 'left'"),
         (["--width", "2"], "give --depth 2 or more"),
         (["--policy", "recogniser"], "use it with task ar"),
         (["--scenes", "apartment:val:1"], "wiw: apartment:val:1: no such file"),
@@ -86,7 +86,9 @@ def test_facts_of_scenes_are_whole_in_80_columns(
     two_rooms: str, tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setenv("COLUMNS", "80")
-    monkeypatch.setattr("wiw.cli.scenes._facts", lambda _: ["a" * 40, "10.5 x 12.2 x 2.6", "1,108,123", *["1234"] * 5])
+    monkeypatch.setattr(
+        "wiw.cli.scenes._list_facts", lambda _: ["a" * 40, "10.5 x 12.2 x 2.6", "1,108,123", *["1234"] * 5]
+    )
     assert main(["scenes", two_rooms, "--views", "1", "--out", str(tmp_path / "sheet.png")]) == 0
     shown = capsys.readouterr().out
     assert "…" not in shown and max(map(len, shown.splitlines()[:4])) <= 80

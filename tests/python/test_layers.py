@@ -23,6 +23,7 @@ CPP_ROWS = [
 ]
 FACES = {
     "types",
+    "typed_values",
     "weight_file",
     "errors",
     "benchmark",

@@ -134,7 +134,7 @@ def test_a_run_that_was_stopped_goes_on(run: Path, tmp_path: Path, monkeypatch: 
         (["--tasks", "slide_block,slide_block"], "different ones"),
         (["--preset", "official"], "there are default, paper"),
         (["--task-option", "actions=0"], "must be positive"),
-        (["--task-option", "decisions=3"], "unknown rules decisions; there are actions"),
+        (["--task-option", "decisions=3"], "unknown rule 'decisions'; there are actions"),
     ],
 )
 def test_what_does_not_apply_is_refused(flags: list[str], said: str, tmp_path: Path, capsys: Any) -> None:
@@ -145,7 +145,7 @@ def test_what_does_not_apply_is_refused(flags: list[str], said: str, tmp_path: P
 
 def test_other_tasks_have_no_tasks(capsys: Any) -> None:
     assert main(["run", "imagenav", "--tasks", "push_buttons", "--policy", "heuristic"]) == 2
-    assert "unknown rules tasks" in capsys.readouterr().err
+    assert "unknown rule 'tasks'" in capsys.readouterr().err
     assert main(["episodes", "manipulation"]) == 2
     assert "a function of the seed" in capsys.readouterr().err
 

@@ -42,7 +42,8 @@ from wiw.policies.navigator.candidates import (  # noqa: E402
     measure_arrivals,
 )
 from wiw.policies.navigator.network import CENTRES, Network, to_input  # noqa: E402
-from wiw.policies.navigator.ways import UNKNOWN_COST, WayMap, get_centres, to_cells  # noqa: E402
+from wiw.policies.navigator.way_cells import WayCells  # noqa: E402
+from wiw.policies.navigator.ways import UNKNOWN_COST, WayMap  # noqa: E402
 from wiw.policies.navigator.weights import load, save  # noqa: E402
 
 pytestmark = pytest.mark.usefixtures("one_torch_thread")
@@ -51,6 +52,8 @@ CARD = {"shares": [1 / 9] * 9, "similarity": [[3.5 - 0.25 * k, 0.4] for k in ran
 KEY = Key(0, 0)
 EVEN = np.full(32, 1 / 32)
 NEUTRAL = np.zeros(9)
+CELLS = WayCells()
+"""Within 9 m of the start."""
 
 
 def tiny_network(seed: int = 0) -> Network:
@@ -127,25 +130,50 @@ def test_weights_are_saved_with_what_they_are_built_of(tmp_path: Path) -> None:
 
 
 def test_ways_lead_round_walls_and_begin_where_the_wall_ends() -> None:
-    way_map = WayMap(known_floor(WALL))
+    way_map = WayMap(known_floor(WALL), CELLS)
     ways = way_map.measure_ways(np.array([[0.0, 0.0], [0.0, -3.0]]))
-    (behind,) = to_cells(np.array([[2.0, 0.1]]))
+    (behind,) = CELLS.find(np.array([[2.0, 0.1]]))
     assert ways.metres[0, behind] == pytest.approx(2 * np.hypot(0.9, 2.2) + 1.1, abs=0.7)
     assert -1.9 < ways.azimuths[0, behind] < -0.8  # to the right, where the wall ends
     assert abs(ways.azimuths[1, behind]) < 0.9
     cells = way_map.trace(ways, 0, behind)
-    assert get_centres()[cells][:, 1].min() < -1.9
-    assert np.allclose(get_centres()[cells[-1]], get_centres()[behind])
+    assert CELLS.centres[cells][:, 1].min() < -1.9
+    assert np.allclose(CELLS.centres[cells[-1]], CELLS.centres[behind])
 
 
 def test_unknown_floor_is_farther_and_what_is_occupied_is_none() -> None:
     grid = known_floor(side=1.0)
-    ways = WayMap(grid).measure_ways(np.zeros((1, 2)))
-    near, far = (ways.metres[0, to_cells(np.array([[x, 0.1]]))[0]] for x in (0.7, 2.7))
+    ways = WayMap(grid, CELLS).measure_ways(np.zeros((1, 2)))
+    near, far = (ways.metres[0, CELLS.find(np.array([[x, 0.1]]))[0]] for x in (0.7, 2.7))
     assert near == pytest.approx(0.7, abs=0.25)
     assert far == pytest.approx(1 + 1.7 * UNKNOWN_COST, abs=0.35)
-    blocked = WayMap(known_floor((0.6, 1.0, -1.0, 1.0), side=1.0))
-    assert not (blocked.open | blocked.unknown).ravel()[to_cells(np.array([[0.8, 0.1]]))].any()
+    blocked = WayMap(known_floor((0.6, 1.0, -1.0, 1.0), side=1.0), CELLS)
+    assert not (blocked.open | blocked.unknown).ravel()[CELLS.find(np.array([[0.8, 0.1]]))].any()
+
+
+def test_the_map_grows_on_the_sides_where_places_lie_beyond_9_m() -> None:
+    inside = np.array([[-9.0, 8.99], [8.99, -9.0], [0.0, 0.0]])
+    assert WayCells.around(inside) == CELLS and CELLS.shape == (90, 90) and CELLS.contain(inside)
+    assert CELLS.centres[0].tolist() == pytest.approx([-8.9, -8.9])
+    assert CELLS.find(inside).tolist() == [89, 89 * 90, 45 * 90 + 45]
+    far = np.array([[0.0, 0.0], [9.1, -17.5]])
+    assert not CELLS.contain(far)
+    wide = WayCells.around(far)
+    assert (wide.low, wide.high) == ((-45, -125), (85, 45)) and wide.contain(far)
+    np.testing.assert_allclose(wide.centres[wide.find(far)], far, atol=0.1001)
+    assert np.abs(wide.centres[wide.find_near(far[1], 0.5)] - far[1]).max() < 0.5
+
+
+def test_a_larger_map_changes_nothing_in_a_closed_room() -> None:
+    walls = ((-4.0, 4.0, 3.6, 4.0), (-4.0, 4.0, -4.0, -3.6), (3.6, 4.0, -4.0, 4.0), (-4.0, -3.6, -4.0, 4.0))
+    grid, places = known_floor(*walls, (0.8, 1.0, -2.0, 3.6)), np.array([[0.0, 0.0], [0.0, -3.0]])
+    wide = WayCells.around(np.array([[-20.0, 3.0], [2.0, 11.0]]))
+    small, large = (WayMap(grid, cells).measure_ways(places) for cells in (CELLS, wide))
+    inner = np.flatnonzero(np.isfinite(small.metres[0]))
+    outer = wide.find(CELLS.centres[inner])
+    assert len(inner) > 1000 and np.isfinite(large.metres[0]).sum() == len(inner)
+    np.testing.assert_array_equal(large.metres[:, outer], small.metres[:, inner])
+    np.testing.assert_array_equal(large.azimuths[:, outer], small.azimuths[:, inner])
 
 
 # -- the belief --------------------------------------------------------------------------------------------------------
@@ -162,7 +190,7 @@ def looking(x: float, y: float, towards: float, sharpness: float = 4.0) -> Evide
 
 
 def believe(grid: OccupancyGrid, *evidence: Evidence, trail: Any = ((0.0, 0.0),)) -> NDArray[np.float64]:
-    way_map = WayMap(grid)
+    way_map = WayMap(grid, CELLS)
     ways = way_map.measure_ways(np.array([own.pose[:2] for own in evidence]))
     return compute_belief(way_map, evidence, ways, np.array(trail, float), np.array(CENTRES), PLAIN)
 
@@ -172,21 +200,21 @@ def test_bearings_of_two_places_cross_where_the_goal_is() -> None:
     places = ((0.0, 0.0), (2.0, -1.5), (-1.0, 2.0))
     evidence = [looking(*place, towards=float(np.arctan2(*(goal - place)[::-1])), sharpness=8.0) for place in places]
     belief = believe(known_floor(), *evidence)
-    assert belief.sum() == pytest.approx(1) and np.linalg.norm(get_centres()[belief.argmax()] - goal) < 0.7
-    assert belief[to_cells(np.array([[-2.0, -2.0]]))[0]] < 0.01 * belief.max()
+    assert belief.sum() == pytest.approx(1) and np.linalg.norm(CELLS.centres[belief.argmax()] - goal) < 0.7
+    assert belief[CELLS.find(np.array([[-2.0, -2.0]]))[0]] < 0.01 * belief.max()
 
 
 def test_the_bearing_is_that_of_the_way_and_not_of_the_straight_line() -> None:
     """To the right the wall ends; so a place before it that says "right" speaks of what is behind the wall, too."""
     belief = believe(known_floor(WALL), looking(0.0, 0.0, towards=-1.4))
-    behind, beside = to_cells(np.array([[2.1, 0.1], [0.1, 2.1]]))
+    behind, beside = CELLS.find(np.array([[2.1, 0.1], [0.1, 2.1]]))
     assert belief[behind] > 5 * belief[beside]
 
 
 def test_near_places_draw_the_belief_and_visited_ones_repel_it() -> None:
     close = Evidence(np.zeros(3), EVEN, np.array([2.0, 2, 2, 0, 0, 0, 0, 0, 0]))
     belief = believe(known_floor(), close)
-    away = np.linalg.norm(get_centres(), axis=1)
+    away = np.linalg.norm(CELLS.centres, axis=1)
     assert (belief[away < VISITED] == 0).all()
     assert VISITED < away[belief.argmax()] < 1.6
 
@@ -200,10 +228,10 @@ def test_places_close_together_share_their_weight() -> None:
 
 
 def test_peaks_are_apart() -> None:
-    worth = np.zeros(len(get_centres()))
-    first, beside, second = to_cells(np.array([[0.1, 0.1], [0.5, 0.1], [2.1, 0.1]]))
+    worth = np.zeros(len(CELLS.centres))
+    first, beside, second = CELLS.find(np.array([[0.1, 0.1], [0.5, 0.1], [2.1, 0.1]]))
     worth[[first, beside, second]] = 3.0, 2.0, 1.0
-    assert find_peaks(worth, 5) == [first, second]
+    assert find_peaks(CELLS, worth, 5) == [first, second]
 
 
 # -- candidates --------------------------------------------------------------------------------------------------------
@@ -211,9 +239,9 @@ def test_peaks_are_apart() -> None:
 
 def test_plans_go_round_corners_and_fill_the_horizon() -> None:
     grid = known_floor(WALL)
-    way_map = WayMap(grid)
+    way_map = WayMap(grid, CELLS)
     ways = way_map.measure_ways(np.zeros((1, 2)))
-    target = int(to_cells(np.array([[2.1, 0.1]]))[0])
+    target = int(CELLS.find(np.array([[2.1, 0.1]]))[0])
     plans = list_candidates(grid, way_map, ways, np.zeros(3), [target], 45)
     assert len({plan.actions.tobytes() for plan in plans}) == len(plans) > 8
     route = plans[0]
@@ -227,7 +255,7 @@ def test_plans_go_round_corners_and_fill_the_horizon() -> None:
 def test_routes_stay_on_the_cropped_floor(horizon: int) -> None:
     """The map of the search ends near the agent; a wall there must not lead it over the edge."""
     grid = known_floor((0.3, 0.5, -3.0, 3.0), (-3.0, 0.4, 0.4, 0.6))
-    way_map, far = WayMap(grid), to_cells(np.array([[3.9, 3.9], [-3.9, -3.9], [2.1, 0.1]]))
+    way_map, far = WayMap(grid, CELLS), CELLS.find(np.array([[3.9, 3.9], [-3.9, -3.9], [2.1, 0.1]]))
     ways = way_map.measure_ways(np.zeros((1, 2)))
     plans = list_candidates(grid, way_map, ways, np.array([0.0, 0.0, 0.3]), [int(cell) for cell in far], horizon)
     assert {len(plan.actions) for plan in plans} == {horizon}
@@ -237,9 +265,9 @@ def test_routes_stay_on_the_cropped_floor(horizon: int) -> None:
 
 def test_targets_to_which_no_way_leads_are_left_out() -> None:
     grid = known_floor((1.0, 1.2, -10, 10), side=10)  # a wall from edge to edge
-    way_map = WayMap(grid)
+    way_map = WayMap(grid, CELLS)
     ways = way_map.measure_ways(np.zeros((1, 2)))
-    here, beyond = (int(cell) for cell in to_cells(np.array([[0.1, 2.1], [2.1, 0.1]])))
+    here, beyond = (int(cell) for cell in CELLS.find(np.array([[0.1, 2.1], [2.1, 0.1]])))
     assert np.isinf(ways.metres[0, beyond])
     both = list_candidates(grid, way_map, ways, np.zeros(3), [beyond, here], 8)
     (nowhere, *_), (route, *_) = list_candidates(grid, way_map, ways, np.zeros(3), [beyond], 8), both
@@ -248,17 +276,17 @@ def test_targets_to_which_no_way_leads_are_left_out() -> None:
 
 def test_where_no_way_leads_anywhere_the_agent_looks_around() -> None:
     grid = known_floor((-4, 4, -4, -0.15), (-4, 4, 0.15, 4), (-4, -0.15, -4, 4), (0.15, 4, -4, 4))
-    way_map = WayMap(grid)
-    here = int(to_cells(np.zeros((1, 2)))[0])
+    way_map = WayMap(grid, CELLS)
+    here = int(CELLS.find(np.zeros((1, 2)))[0])
     (plan,) = list_candidates(grid, way_map, way_map.measure_ways(np.zeros((1, 2))), np.zeros(3), [here], 5)
     assert plan.actions.tolist() == [TURN_LEFT] * 4
 
 
 def test_arrivals_count_turns_and_what_is_passed_on_the_way() -> None:
     plan = make_candidate(np.zeros(3), np.array([FORWARD] * 6, np.int8))
-    ways = WayMap(known_floor()).measure_ways(plan.poses[-1:, :2])
+    ways = WayMap(known_floor(), CELLS).measure_ways(plan.poses[-1:, :2])
     found = measure_arrivals(plan, ways, 0)
-    passed, ahead, back = to_cells(np.array([[0.7, 0.1], [3.1, 0.1], [-1.9, 0.1]]))
+    passed, ahead, back = CELLS.find(np.array([[0.7, 0.1], [3.1, 0.1], [-1.9, 0.1]]))
     assert found[passed] == 2  # after 0.4 m it is 0.3 m away
     assert found[ahead] == pytest.approx(6 + (1.9 - 0.45) / 0.2, abs=1.5)
     assert found[back] == pytest.approx(6 + 8 + (3.1 - 0.45) / 0.2, abs=2)
@@ -378,11 +406,27 @@ def test_extending_changes_nothing_that_is_known_of_the_real_episode(situate: An
 def test_the_agent_keeps_to_its_target_until_another_is_much_better() -> None:
     policy = tiny_policy(loyalty=0.5)
     memory = Memory(None, None)  # type: ignore[arg-type]
-    worth = np.zeros(len(get_centres()))
-    first, second = to_cells(np.array([[2.1, 0.1], [-2.1, 0.1]]))
+    worth = np.zeros(len(CELLS.centres))
+    first, second = CELLS.find(np.array([[2.1, 0.1], [-2.1, 0.1]]))
     for value, expected in ((0.9, first), (1.9, first), (2.1, second), (1.9, second), (0.4, first)):
         worth[[first, second]] = 1.0, value
-        assert policy._choose_target(memory, worth) == expected
+        assert policy._choose_target(memory, CELLS, worth) == expected
+
+
+@pytest.mark.parametrize("start", [8.7, 12.0])
+def test_the_agent_goes_on_beyond_9_m_from_the_start(start: float) -> None:
+    """All that it has seen says: straight ahead, 2 to 3 m from here."""
+    policy, pose = tiny_policy(), np.array([start, 0.0, 0.0])
+    ahead = Evidence(
+        pose, np.where(np.abs(np.arange(32) - 15.5) < 2, 0.25, 0.0), np.array([-2.0, -2, 0, 2, 2, 0, -2, -2, -2])
+    )
+    memory = Memory(None, None, known_floor(side=16.0), [ahead])  # type: ignore[arg-type]
+    observation = Observation(np.zeros((576, 1024, 3), np.uint8), np.zeros((480, 480, 3), np.uint8), pose)
+    situation = Situation(observation, Goal("imagenav"), KEY, memory)
+    (plans,) = policy.propose([situation], 3, 12)
+    assert memory.target is not None and np.linalg.norm(memory.target - [start + CENTRES[3], 0.0]) < 0.5
+    end = make_candidate(pose, plans[0].actions).poses[-1]
+    assert end[0] > start + 1.0 and abs(end[1]) < 0.5
 
 
 def test_what_the_policy_needs_is_asked_for_in_words(situate: Any) -> None:
@@ -395,7 +439,7 @@ def test_what_the_policy_needs_is_asked_for_in_words(situate: Any) -> None:
         policy.begin(Goal("ar", choices=("chair",)), Key(0, 0))
     with pytest.raises(ArgumentError, match="unknown option 'depth'"):
         tiny_policy(depth=3)
-    with pytest.raises(ArgumentError, match="expected a number for doubt, got 'much'"):
+    with pytest.raises(ArgumentError, match="doubt: expected a number, got 'much'"):
         tiny_policy(doubt="much")
     for out_of_range in ({"patience": 0}, {"spacing": -1}, {"targets": 0}, {"doubt": 1}, {"commitment": 2}):
         with pytest.raises(ArgumentError, match=r"policy navigator: expected (patience|doubt)"):

@@ -508,7 +508,7 @@ def test_rates_follow_the_schedule() -> None:
 @pytest.mark.parametrize(
     ("options", "said"),
     [
-        ({"lr": 1}, "no recipe has 'lr'"),
+        ({"lr": 1}, "recipe: unknown name 'lr'"),
         ({"rate": "fast"}, "rate: expected a number, got 'fast'"),
         ({"rate": -1.0}, "rate: expected a finite number above 0"),
         ({"batch": 3, "rows": 2}, "rows: expected a divisor of batch"),
@@ -572,7 +572,7 @@ def test_the_command_trains(data: Path, weights: Any, tmp_path: Path, capsys: py
         (["ltx-action", "--scenes", "house.glb"], "--scenes: ltx-action does not train on scenes"),
         (["warpnet", "--data", "data"], "--data: warpnet trains on other data"),
         (["ltx-action", "--data", "nowhere"], "meta.json is missing"),
-        (["ltx-action", "--data", "nowhere", "--option", "lr=1"], "no recipe has 'lr'"),
+        (["ltx-action", "--data", "nowhere", "--option", "lr=1"], "recipe: unknown name 'lr'"),
     ],
 )
 def test_the_command_refuses(arguments: list[str], said: str, capsys: pytest.CaptureFixture[str]) -> None:

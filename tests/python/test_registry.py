@@ -105,7 +105,7 @@ def test_plugins_are_loaded_by_entry_point(monkeypatch: pytest.MonkeyPatch) -> N
         "rules": EntryPoint("rules", "wiw.policies.heuristic:Heuristic", "wiw.policies"),
         "gone": EntryPoint("gone", "no_such_package:Policy", "wiw.policies"),
     }
-    monkeypatch.setattr(Registry, "_plugins", lambda self: points)
+    monkeypatch.setattr(Registry, "_list_plugins", lambda self: points)
     assert POLICIES.make("rules") is not None and "rules" in POLICIES.names()
     with pytest.raises(RegistryError, match="'gone' cannot be loaded: ModuleNotFoundError"):
         POLICIES.find("gone")

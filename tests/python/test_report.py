@@ -10,8 +10,8 @@ from wiw.errors import ArgumentError
 from wiw.report.episodes import read_stories
 from wiw.report.maps import frame_of_picture, frame_of_points, start_and_goal, trail
 from wiw.report.page import SCALES, render, sentence
-from wiw.report.plans import glyphs
-from wiw.report.plots import BLAME_COLORS, _readable_on
+from wiw.report.plans import format_glyphs
+from wiw.report.plots import BLAME_COLORS, _choose_text_color
 from wiw.report.story import Album
 from wiw.report.templating import environment
 from wiw.runs.pictures import choose_pictured_episodes
@@ -152,8 +152,8 @@ def test_the_title_names_task_and_folder_once(log):
 
 def test_plots_carry_no_metadata_and_numbers_on_bars_can_be_read(page):
     assert not any(tag.startswith(("rdf:", "metadata")) for tag, _ in page.tags)
-    assert _readable_on("#ffffff") == "black" and _readable_on("#000000") == "white"
-    assert _readable_on(BLAME_COLORS["beyond"]) == "black", "3.2 : 1 in white"
+    assert _choose_text_color("#ffffff") == "black" and _choose_text_color("#000000") == "white"
+    assert _choose_text_color(BLAME_COLORS["beyond"]) == "black", "3.2 : 1 in white"
 
 
 def test_counts_of_one_are_singular():
@@ -233,4 +233,4 @@ def test_maps_put_world_points_in_their_place():
 
 
 def test_glyphs_name_every_primitive():
-    assert glyphs([1, 2, 3]) == "↑↖↗" and glyphs([99]) == "(99)"
+    assert format_glyphs([1, 2, 3]) == "↑↖↗" and format_glyphs([99]) == "(99)"

@@ -24,7 +24,7 @@ import wiw
 from wiw.errors import ArgumentError
 from wiw.report.page import render
 from wiw.report.site import write_view
-from wiw.report.stage import SIDE, Stage, signs, stage_of
+from wiw.report.stage import SIDE, Stage, format_signs, read_stage
 from wiw.runs.films import film, film_episodes
 from wiw.runs.rows import decode_jpeg, select_frames
 from wiw.studies.evaluate import evaluate
@@ -67,8 +67,8 @@ HERE = (0.2, 0.0, 1.0)
     ],
 )
 def test_signs_say_where_a_gripper_goes_as_the_camera_sees_it(plan: Any, said: str) -> None:
-    assert signs(plan, HERE) == said
-    assert signs(plan, HERE, shut=True)[1:2] in ("○", "") or plan[0][6] == 0
+    assert format_signs(plan, HERE) == said
+    assert format_signs(plan, HERE, shut=True)[1:2] in ("○", "") or plan[0][6] == 0
 
 
 def test_plans_are_drawn_where_the_camera_sees_them() -> None:
@@ -96,7 +96,7 @@ def test_records_say_how_it_ended_and_what_each_kind_shows(log: Any) -> None:
         assert len(rows) == 2 and all(row["before_distance"] is None for row in rows)
         assert ["end" in log.store.images(arm, 1, row["decision"]) for row in rows] == [False, True]
     assert decode_jpeg(log.store.images("none", 1, 1)["end"]).shape == (480, 480, 3)
-    assert stage_of(log.store.info) is not None
+    assert read_stage(log.store.info) is not None
 
 
 def test_films_show_what_truly_happened(log: Any, html: str) -> None:

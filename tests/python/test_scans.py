@@ -28,6 +28,7 @@ from wiw.render import Renderer
 from wiw.runs.recipes import AgentRecipe, TaskRecipe
 from wiw.scenes import basis
 from wiw.scenes.scans import hm3d, labels
+from wiw.scenes.scans.glb import Glb
 from wiw.scenes.scans.scene_dataset import words_of
 from wiw.studies.evaluate import evaluate
 from wiw.tasks.ar import AR
@@ -616,3 +617,16 @@ def test_mutated_files_end_in_an_error_of_ours_or_a_scene(tmp_path: Path, kind: 
             refused += 1
         part.write_bytes(whole)
     assert refused > 2
+
+
+def test_nodes_of_a_labelled_mesh_without_scenes_count_once() -> None:
+    parent = {"translation": [1, 2, 3], "children": [1], "mesh": 0}
+    nodes = [parent, {"translation": [0, 0, 4], "mesh": 1}, {"mesh": 2}]
+    scenes: list[dict[str, Any]] = [{"nodes": [0, 2]}]
+    for document in ({"nodes": nodes}, {"nodes": nodes, "scenes": scenes, "scene": 0}):
+        placed = dict(Glb(Path("x.glb"), document, b"").node_transforms)
+        assert {mesh: own[:3, 3].tolist() for mesh, own in placed.items()} == {0: [1, 2, 3], 1: [1, 2, 7], 2: [0, 0, 0]}
+        assert len(Glb(Path("x.glb"), document, b"").node_transforms) == 3
+    assert Glb(Path("x.glb"), {"nodes": nodes, "scenes": [{"name": "empty"}]}, b"").node_transforms == []
+    with pytest.raises(ValueError, match="circle"):
+        list(Glb(Path("x.glb"), {"nodes": [{"children": [1]}, {"children": [0]}]}, b"").node_transforms)

@@ -888,33 +888,33 @@ def test_a_batch_is_of_one_shape_and_no_shape_starves():
 def test_announced_rows_are_waited_for_but_not_for_ever():
     clock = Clock()
     queue = filled(job(), rest=2, clock=clock)
-    assert queue.due()[1] == ANNOUNCED
+    assert queue.find_due()[1] == ANNOUNCED
     clock.now = 0.6
     queue.put(job(1), "a", 1)
-    assert queue.due()[1] == ANNOUNCED
+    assert queue.find_due()[1] == ANNOUNCED
     clock.now = 0.6 + ANNOUNCED
-    assert queue.due()[1] <= 0
+    assert queue.find_due()[1] <= 0
     queue.put(job(2), "a", 0)
-    assert queue.due()[1] == 0.0
+    assert queue.find_due()[1] == 0.0
 
 
 def test_clients_that_may_still_ask_are_waited_for_a_share_of_a_batch():
     clock = Clock()
     queue = filled(job(), window=0.1, clients=("a", "b"), clock=clock)
-    assert queue.due()[1] == 0.0  # nothing is known of the time that a batch takes
+    assert queue.find_due()[1] == 0.0  # nothing is known of the time that a batch takes
     queue.batch_seconds = 2.0
-    assert queue.due()[1] == pytest.approx(0.2)
+    assert queue.find_due()[1] == pytest.approx(0.2)
     queue.batch_seconds = 1000.0
-    assert queue.due()[1] == 1.0
+    assert queue.find_due()[1] == 1.0
     queue.put(job(1), "b")
-    assert queue.due()[1] == 0.0  # all have asked
+    assert queue.find_due()[1] == 0.0  # all have asked
 
 
 def test_what_nobody_waits_for_is_not_begun():
     clock = Clock()
     queue = filled(job(0, expires=1.0), job(1, expires=3.0), clock=clock)
     clock.now = 2.0
-    assert [one.id for one in queue.due()[0]] == [b"1"]
+    assert [one.id for one in queue.find_due()[0]] == [b"1"]
     assert [one.id for one in queue.take_expired()] == [b"0"]
     assert len(queue) == 1
 
@@ -923,7 +923,7 @@ def test_a_client_that_has_gone_leaves_only_what_others_want():
     own, shared = job(0), job(1)
     queue = filled(own, shared, clients=("a", "b"))
     own.askers, shared.askers = {"a"}, {"a", "b"}
-    assert queue.leave("a") == [own] and queue.due()[0] == [shared]
+    assert queue.leave("a") == [own] and queue.find_due()[0] == [shared]
 
 
 def test_a_queue_takes_no_more_than_it_may_and_ends():

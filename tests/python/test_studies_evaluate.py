@@ -185,6 +185,25 @@ def test_an_existing_run_is_continued_only_on_request(reference, tmp_path):
         resume_run(tmp_path / "run")
 
 
+def test_a_run_gains_arms_on_request_unless_a_rule_may_stop_it(tmp_path):
+    arms = {"none": LineAgent(0.5), "warp": LineAgent(0.8)}
+
+    def run_some(*names, **options):
+        some = {name: arms[name] for name in names}
+        return run_arms(LineTask(), some, 8, out=tmp_path / "run", progress=False, salt="pepper", **options)
+
+    begun = run_some("none").episodes
+    with pytest.raises(StoreError, match="another configuration"):
+        run_some("none", "warp", resume=True)
+    grown = run_some("none", "warp", resume=True, more_arms=True)
+    assert grown.complete and grown.episodes[:8] == begun
+    assert facts(grown)[0] == facts(run(tmp_path / "whole", salt="pepper"))[0]
+    looked = {"until": "width(none)<1", "more_arms": True, "progress": False}
+    run_arms(LineTask(), {"none": arms["none"]}, 8, out=tmp_path / "until", **looked)
+    with pytest.raises(StoreError, match="may stop early"):
+        run_arms(LineTask(), arms, 8, out=tmp_path / "until", resume=True, **looked)
+
+
 def test_a_run_whose_creation_was_cut_off_is_begun_again(reference, tmp_path):
     (tmp_path / "run").mkdir()
     sqlite3.connect(store_path(tmp_path / "run")).execute("PRAGMA journal_mode = WAL")

@@ -4,6 +4,7 @@
 from __future__ import annotations
 
 import json
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -11,7 +12,7 @@ import pytest
 
 from wiw.analysis.errors import METRES, summarise_errors
 from wiw.cli import main
-from wiw.errors import ArgumentError
+from wiw.errors import ArgumentError, StoreError
 from wiw.experiments.errors import ERRORS
 from wiw.report.error_page import write_errors
 from wiw.report.error_tables import explain, print_errors
@@ -140,14 +141,17 @@ def test_what_makes_no_sense_is_left_out_by_name() -> None:
     assert [dose for _, dose in ErrorSettings(doses=2, kinds=("lag",)).list_arms("ar").values()] == [2.0, 4.0]
 
 
-def test_a_study_goes_on_where_it_stopped(two_rooms: str, tmp_path: Path, capsys) -> None:
+def test_a_study_goes_on_where_it_stopped_and_gains_kinds(two_rooms: str, tmp_path: Path, capsys) -> None:
     settings = ErrorSettings(
         tasks=("imagenav",), kinds=("blur", "ignored"), doses=1, episodes=2, scenes=two_rooms, size=(64, 128)
     )
+    study_errors(tmp_path / "study", replace(settings, kinds=("ignored",)))
     found = study_errors(tmp_path / "study", settings)
     (table,) = found.tables
     assert [line.arm for line in table.lines] == ["error-blur@64", "error-ignored@1"] and table.episodes == 2
     stores = sorted((tmp_path / "study").rglob("run.sqlite"))
+    with pytest.raises(StoreError, match="another configuration"):
+        study_errors(tmp_path / "study", replace(settings, kinds=("blur",)))
     again = study_errors(tmp_path / "study", settings)
     assert again.to_json() == found.to_json() == read_errors(tmp_path / "study", settings).to_json()
     assert stores == sorted((tmp_path / "study").rglob("run.sqlite"))

@@ -168,7 +168,7 @@ def test_the_rate_rises_stays_and_falls() -> None:
         ({"places": 0}, "places: expected 1 or more"),
         ({"pure_noise": 1.5}, "pure_noise: expected a share"),
         ({"least_level": 0}, "least_level: expected a level"),
-        ({"lora": 4}, "no recipe has 'lora'"),
+        ({"lora": 4}, "recipe: unknown name 'lora'"),
     ],
 )
 def test_a_recipe_that_cannot_be_is_refused(changes: dict[str, Any], said: str) -> None:
@@ -244,7 +244,7 @@ def test_the_command_trains_measures_and_is_run(
         ([], "pocket trains on a dataset; give a folder of `wiw collect navigation` by --data"),
         (["--data", "nowhere"], "nowhere"),
         (["--data", "d", "--device", "cuda"], "--device: pocket trains on the CPU"),
-        (["--data", "d", "--option", "lr=1"], "no recipe has 'lr'"),
+        (["--data", "d", "--option", "lr=1"], "recipe: unknown name 'lr'"),
     ],
 )
 def test_what_it_cannot_use_is_refused(options: list[str], said: str, tmp_path: Path, capsys: Any) -> None:

@@ -410,17 +410,17 @@ def test_a_client_can_be_sent_to_another_process() -> None:
 
 def test_the_command_names_scripts_by_their_content(tmp_path: Path) -> None:
     """Answers are kept under the model's name, so an edited script must have another one."""
-    from wiw.cli.serve_vlm import _client
+    from wiw.cli.serve_vlm import _make_client
 
     file = tmp_path / "script.py"
     file.write_text("def answer(call):\n    return 'one'\n")
-    first = _client(f"{file}:answer", 0, "")
+    first = _make_client(f"{file}:answer", 0, "")
     file.write_text("def answer(call):\n    return 'two'\n")
-    second = _client(f"{file}:answer", 0, "")
+    second = _make_client(f"{file}:answer", 0, "")
     request = Request((user("Say"),))
     assert [client.ask([request])[0].text for client in (first, second)] == ["one", "two"]
     assert first.model.startswith("answer-") and first.model != second.model
-    assert _client("mock", 0, "").model == "mock"
+    assert _make_client("mock", 0, "").model == "mock"
 
 
 def test_a_server_with_a_token_answers_nobody_without_it(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -252,13 +252,13 @@ def test_constants_made_for_a_rollout_serve_training_too() -> None:
 def test_the_demo_leaves_it_out_where_torch_is_missing(
     monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    from wiw.cli.demo import PARTS, _arms, _can_run
+    from wiw.cli.demo import PARTS, _can_run, _choose_arms
 
     names = PARTS[0].arms
-    assert _arms(names) == list(names)
+    assert _choose_arms(names) == list(names)
     assert not capsys.readouterr().out
     monkeypatch.setattr("wiw.world_models.base.importlib.util.find_spec", lambda name: None)
-    assert _arms(names) == ["none", "copy", "warp", "oracle"]
+    assert _choose_arms(names) == ["none", "copy", "warp", "oracle"]
     assert "warpnet is left out: torch" in capsys.readouterr().out
     assert [part.task for part in PARTS if _can_run(part)] == ["imagenav", "manipulation"]
     assert "aeqa with policy explorer is left out: torch, safetensors not installed" in capsys.readouterr().out

@@ -120,7 +120,7 @@ def split_by_kind(done: Done, metrics: Sequence[Metric], kind: str, seed: int) -
                     estimates.setdefault(arm, {})[each] = _estimate(own, metric, seed)
         if estimates:
             heading = "Success rate" if metric.name == SUCCESS.name else metric.label
-            title = f"{_title(metric)} by {kind}"
+            title = f"{_make_title(metric)} by {kind}"
             found.append(
                 Breakdown("kinds", title, f"{heading} by {kind}", "", kind, metric, estimates, arms_across=True)
             )
@@ -201,7 +201,7 @@ def read_anytime_curve(done: Done, cuts: Cuts, seed: int) -> list[Breakdown]:
             at = cuts.make_metric(cut)
             if ended and all(at.name in o["metrics"] for o in ended.values()):
                 estimates.setdefault(arm, {})[str(cut)] = _estimate(list(ended.values()), at, seed)
-    title = f"{_title(cuts.metric)} if cut after so many {cuts.unit}"
+    title = f"{_make_title(cuts.metric)} if cut after so many {cuts.unit}"
     heading = f"{cuts.metric.label} if cut after so many {cuts.unit}"
     found = Breakdown("anytime", title, heading, cuts.about, "cut", cuts.metric, estimates, cut_unit=cuts.unit)
     return [found] if estimates else []
@@ -293,5 +293,5 @@ def _estimate(outcomes: Sequence[Mapping[str, Any]], metric: Metric, seed: int) 
     return estimate_mean(values, scenes, metric, seed=seed)
 
 
-def _title(metric: Metric) -> str:
+def _make_title(metric: Metric) -> str:
     return " ".join(part for part in (metric.label, metric.unit, "↑" if metric.higher_is_better else "↓") if part)

@@ -141,7 +141,7 @@ def summarise_errors(
         for metric in (SUCCESS, ANSWER_SCORE)
         if all(metric.name in row["metrics"] for own in done.values() for row in own.values())
     )
-    lines = _adjust([_line(arm, *arms[arm], done, measured, metric, seed) for arm in shown])
+    lines = _adjust([_summarise_arm(arm, *arms[arm], done, measured, metric, seed) for arm in shown])
     pooled = _Pooled(pooled_arms, sorted(scored), done, measured, metric, seed)
     costs, gaps = _list_costs([line for line in lines if line.arm in pooled_arms], pooled)
     return ErrorTable(
@@ -215,7 +215,9 @@ def _estimate(done: Mapping[int, Mapping[str, Any]], metric: Metric, seed: int) 
     return estimate_mean(values, [row["scene"] for row in done.values()], metric, seed=seed)
 
 
-def _line(arm: str, kind: str, dose: float, done: Done, measured: Measured, metric: Metric, seed: int) -> ErrorLine:
+def _summarise_arm(
+    arm: str, kind: str, dose: float, done: Done, measured: Measured, metric: Metric, seed: int
+) -> ErrorLine:
     loss = compare(arm, CEILING, done, metric, seed)
     assert loss is not None
     measures = {}

@@ -73,7 +73,7 @@ class ArmFidelity:
 
 def fidelity(run: Run) -> list[ArmFidelity]:
     """Return one line per arm whose imagined plans were replayed, in the order of the run's table."""
-    return [line for arm in run.arms if (line := _arm(run, arm)) is not None]
+    return [line for arm in run.arms if (line := _summarise_arm(run, arm)) is not None]
 
 
 def choose_columns(lines: Sequence[ArmFidelity]) -> list[Column]:
@@ -81,7 +81,7 @@ def choose_columns(lines: Sequence[ArmFidelity]) -> list[Column]:
     return [column for column in COLUMNS if column.name != "lpips" or not all(math.isnan(o.lpips) for o in lines)]
 
 
-def _arm(run: Run, arm: str) -> ArmFidelity | None:
+def _summarise_arm(run: Run, arm: str) -> ArmFidelity | None:
     found = [row["fidelity"] for row in run.store.decisions(arm) if row["fidelity"] is not None]
     if not found:
         return None
@@ -90,17 +90,17 @@ def _arm(run: Run, arm: str) -> ArmFidelity | None:
     return ArmFidelity(
         arm,
         len(found),
-        100 * _mean(judged),
-        _mean([one["rank"] for one in found]),
-        100 * _mean(best),
-        _mean([one["regret"] for one in found]),
-        _mean([value for one in found for value in one["psnr"]]),
-        _mean([value for one in found for value in one["ssim"]]),
-        _mean([value for one in found for value in one.get("lpips", ())]),
+        100 * _average(judged),
+        _average([one["rank"] for one in found]),
+        100 * _average(best),
+        _average([one["regret"] for one in found]),
+        _average([value for one in found for value in one["psnr"]]),
+        _average([value for one in found for value in one["ssim"]]),
+        _average([value for one in found for value in one.get("lpips", ())]),
     )
 
 
-def _mean(values: Sequence[float | None]) -> float:
+def _average(values: Sequence[float | None]) -> float:
     known = [value for value in values if value is not None and math.isfinite(value)]
     return float(np.mean(known)) if known else math.nan
 

@@ -123,7 +123,7 @@ def summarise_quality(
     labels = [scenes[episode] for episode in episodes]
     measures = tuple(dict.fromkeys(name for sample in samples for name in sample.scores))
     spans = {name: span for card in scorers for name, span in card["scores"].items() if span} | BOUNDS
-    lines = tuple(_line(sample, episodes, scenes, metric, spans, seed) for sample in samples)
+    lines = tuple(_summarise_arm(sample, episodes, scenes, metric, spans, seed) for sample in samples)
     found = tuple(_correlate(name, samples, episodes, labels, seed) for name in measures)
     pictured = {episode for sample in samples for own in sample.scores.values() for episode in own}
     return QualityTable(
@@ -135,7 +135,7 @@ def summarise_quality(
         len(pictured),
         len(set(labels)),
         min(sample.frames for sample in samples),
-        (*notes, *_caveats(found)),
+        (*notes, *_list_caveats(found)),
         tuple(scorers),
     )
 
@@ -156,7 +156,7 @@ def add_paper_quality(
     return {PAPER_QUALITY: q, **scores}
 
 
-def _line(
+def _summarise_arm(
     sample: Sample,
     episodes: Sequence[int],
     scenes: Mapping[int, str],
@@ -192,14 +192,14 @@ def _correlate(
     """Return the correlation over the arms in which a measure was taken, on the episodes that are scored in all."""
     measured = [sample for sample in samples if sample.scores.get(name)]
     success = np.array([[sample.success[episode] for episode in episodes] for sample in measured], np.float64)
-    return correlate(name, success, _matrix(measured, name, episodes), labels, seed)
+    return correlate(name, success, _arrange_scores(measured, name, episodes), labels, seed)
 
 
-def _matrix(samples: Sequence[Sample], name: str, episodes: Sequence[int]) -> NDArray[np.float64]:
+def _arrange_scores(samples: Sequence[Sample], name: str, episodes: Sequence[int]) -> NDArray[np.float64]:
     return np.array([[sample.scores[name].get(episode, math.nan) for episode in episodes] for sample in samples])
 
 
-def _caveats(found: Sequence[Correlation]) -> list[str]:
+def _list_caveats(found: Sequence[Correlation]) -> list[str]:
     """Return in plain words what so few arms can show."""
     arms = max((one.arms for one in found), default=0)
     if arms < LEAST:

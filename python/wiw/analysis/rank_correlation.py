@@ -79,7 +79,7 @@ def correlate(
         )
     several = len(np.unique(labels)) > 1
     clusters = np.unique(labels, return_inverse=True)[1] if several else np.arange(len(labels))
-    means = _means(success, clusters), _means(values, clusters)
+    means = _sum_clusters(success, clusters), _sum_clusters(values, clusters)
     once = np.ones((1, means[0][0].shape[1]))
     rates, worth = (_weigh(own, once)[0] for own in means)
     rho = float(spearman(rates, worth))
@@ -129,7 +129,7 @@ _Sums = tuple[NDArray[np.float64], NDArray[np.float64]]
 """Sums and counts, float64 [arms, clusters]."""
 
 
-def _means(values: NDArray[np.float64], clusters: NDArray[np.int64]) -> _Sums:
+def _sum_clusters(values: NDArray[np.float64], clusters: NDArray[np.int64]) -> _Sums:
     members = np.eye(clusters.max(initial=-1) + 1)[clusters]
     return np.nan_to_num(values) @ members, (~np.isnan(values)).astype(np.float64) @ members
 
@@ -151,10 +151,10 @@ def _bootstrap(means: tuple[_Sums, _Sums], skip: bool, seed: int) -> tuple[float
     known = drawn[~np.isnan(drawn)]
     if len(known) < RESAMPLES / 2:
         return math.nan, math.nan, len(known) / RESAMPLES
-    low, high = _quantiles(known)
+    low, high = _find_interval(known)
     return low, high, len(known) / RESAMPLES
 
 
-def _quantiles(values: NDArray[np.float64]) -> Interval:
+def _find_interval(values: NDArray[np.float64]) -> Interval:
     low, high = np.quantile(values, (0.025, 0.975))
     return float(low), float(high)

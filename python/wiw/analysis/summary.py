@@ -250,22 +250,22 @@ def summarise(
         anytime: whether the run was looked at before it was stopped, so that p must allow for that.
     """
     done, errors = split_outcomes(arms, outcomes)
-    lines = tuple(_line(arm, role_of(arm, policies), done[arm], errors[arm], episodes, seed) for arm in arms)
+    lines = tuple(_summarise_arm(arm, role_of(arm, policies), done[arm], errors[arm], episodes, seed) for arm in arms)
     differences = tuple(
         difference
         for base in ("none", FLOOR)
         if base in arms
-        for difference in _differences_from(base, arms, done, seed, anytime)
+        for difference in _compare_with(base, arms, done, seed, anytime)
     )
     same = len({frozenset(ended) for ended in done.values()}) == 1
     blind = answer_blind(done, tables.cuts) if BLIND not in done else {}
-    baselines = (_line(BLIND, BLIND_ROLE, blind, 0, len(blind), seed),) if blind else ()
+    baselines = (_summarise_arm(BLIND, BLIND_ROLE, blind, 0, len(blind), seed),) if blind else ()
     marks = read_marks(judge, outcomes, arms, tables)
     beside = {**done, BLIND: blind} if blind else done
     if pairs is None:
         pairs = [(arm, base) for base in ("none", FLOOR) if base in arms for arm in arms if arm not in (base, "none")]
     breakdowns = _break_down(beside, pairs, tables, twins, marks, seed)
-    return Summary(lines, differences, same, _utilities(lines, done), breakdowns, baselines, marks)
+    return Summary(lines, differences, same, _list_utilities(lines, done), breakdowns, baselines, marks)
 
 
 def summarise_run(run: Run) -> Summary:
@@ -419,7 +419,7 @@ def role_of(arm: str, policies: Collection[str] = ()) -> str:
     return special or (ANOTHER_POLICY if arm in policies else WORLD_MODEL)
 
 
-def _differences_from(
+def _compare_with(
     base: str, arms: Sequence[str], done: Mapping[str, Mapping[int, Mapping[str, Any]]], seed: int, anytime: bool
 ) -> tuple[Difference, ...]:
     others = [arm for arm in arms if arm not in (base, "none")]
@@ -427,7 +427,9 @@ def _differences_from(
     return adjust_p_values([difference for difference in found if difference is not None])
 
 
-def _utilities(lines: Sequence[ArmSummary], done: Mapping[str, Mapping[int, Mapping[str, Any]]]) -> tuple[Utility, ...]:
+def _list_utilities(
+    lines: Sequence[ArmSummary], done: Mapping[str, Mapping[int, Mapping[str, Any]]]
+) -> tuple[Utility, ...]:
     if FLOOR not in done or CEILING not in done:
         return ()
     others = [line for line in lines if line.name not in (FLOOR, CEILING)]
@@ -504,7 +506,7 @@ def select_metrics(done: Mapping[str, Mapping[int, Mapping[str, Any]]]) -> list[
     ]
 
 
-def _line(
+def _summarise_arm(
     arm: str, role: str, done: Mapping[int, Mapping[str, Any]], errors: int, episodes: int, seed: int
 ) -> ArmSummary:
     estimates = {}

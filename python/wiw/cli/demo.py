@@ -133,7 +133,7 @@ def _run(part: Part, folder: Path) -> int:
     from wiw.runs.recipes import AgentRecipe, TaskRecipe
     from wiw.studies.evaluate import evaluate
 
-    arms = _arms(part.arms)
+    arms = _choose_arms(part.arms)
     print()
     _print_wrapped(f"{part.about}, {len(arms)} world models.")
     print()
@@ -145,7 +145,7 @@ def _run(part: Part, folder: Path) -> int:
     return finish(stoppable(work, folder), report=True, remark=f"This is a demonstration with few episodes. {READY}")
 
 
-def _arms(names: tuple[str, ...]) -> list[str]:
+def _choose_arms(names: tuple[str, ...]) -> list[str]:
     """Return the arms that can run here; say which is left out, and why."""
     from wiw.registry import WORLD_MODELS
 

@@ -46,29 +46,29 @@ def doctor() -> int:
 
 def examine() -> Iterator[Finding]:
     """Return all findings, in the order in which they are shown."""
-    yield from _software()
-    yield from _processor()
-    yield _memory()
-    yield from _rendering()
-    yield _torch()
-    yield _writable("runs folder", Path.cwd())
+    yield from _check_software()
+    yield from _check_processor()
+    yield _check_memory()
+    yield from _check_rendering()
+    yield _check_torch()
+    yield _check_writable("runs folder", Path.cwd())
     yield _cache()
-    yield _writable("temporary files", Path(tempfile.gettempdir()))
+    yield _check_writable("temporary files", Path(tempfile.gettempdir()))
 
 
-def _software() -> Iterator[Finding]:
+def _check_software() -> Iterator[Finding]:
     import wiw
 
     yield Finding("wiw", f"{wiw.__version__} in {Path(wiw.__file__).parent}")
     old = tuple(map(int, platform.python_version_tuple()[:2])) < (3, 10)
     yield Finding("python", platform.python_version(), "wiw needs Python 3.10 or newer" if old else "")
     names = ("numpy", "scipy", "opencv-python-headless", "gymnasium", "matplotlib", "jinja2", "rich", "tyro")
-    missing = [name for name in names if not _version(name)]
+    missing = [name for name in names if not _find_version(name)]
     remedy = f"pip install {' '.join(missing)}" if missing else ""
-    yield Finding("packages", ", ".join(f"{name} {_version(name) or 'missing'}" for name in names), remedy)
+    yield Finding("packages", ", ".join(f"{name} {_find_version(name) or 'missing'}" for name in names), remedy)
 
 
-def _processor() -> Iterator[Finding]:
+def _check_processor() -> Iterator[Finding]:
     from wiw._core import core
     from wiw.runs.platform import processor_name
 
@@ -82,14 +82,14 @@ def _processor() -> Iterator[Finding]:
     yield Finding("instructions", isa, slow)
 
 
-def _memory() -> Finding:
+def _check_memory() -> Finding:
     facts = dict(line.split(":", 1) for line in Path("/proc/meminfo").read_text(encoding="ascii").splitlines())
     total, free = (int(facts[name].split()[0]) / 2**20 for name in ("MemTotal", "MemAvailable"))
     remedy = "a worker needs about 1 GB: use --workers 1 and close other programs" if free < 2 else ""
     return Finding("memory", f"{free:.1f} of {total:.1f} GB free", remedy)
 
 
-def _rendering() -> Iterator[Finding]:
+def _check_rendering() -> Iterator[Finding]:
     from wiw._core import render
     from wiw.errors import BackendError
 
@@ -114,15 +114,15 @@ def _rendering() -> Iterator[Finding]:
         )
 
 
-def _torch() -> Finding:
+def _check_torch() -> Finding:
     """Return whether torch is installed, without importing it, which takes seconds."""
     if importlib.util.find_spec("torch") is None:
         return Finding("torch", "not installed; only learned world models need it (pip install 'wiw[torch]')")
-    return Finding("torch", _version("torch") or "of unknown version")
+    return Finding("torch", _find_version("torch") or "of unknown version")
 
 
-def _writable(name: str, folder: Path) -> Finding:
-    gigabytes = _free_gigabytes(folder)
+def _check_writable(name: str, folder: Path) -> Finding:
+    gigabytes = _count_free_gigabytes(folder)
     detail = f"{folder}, {gigabytes:.0f} GB free"
     if not os.access(folder, os.W_OK):
         return Finding(name, detail, "not writable: go to another folder or give --out")
@@ -136,7 +136,7 @@ def _cache() -> Finding:
     cache = folder()
     files = [path.stat() for path in cache.glob("*")] if cache.is_dir() else []
     there = next(path for path in (cache, *cache.parents) if path.exists())
-    used, free = sum(file.st_size for file in files) / 2**20, _free_gigabytes(there)
+    used, free = sum(file.st_size for file in files) / 2**20, _count_free_gigabytes(there)
     remedy = "nearly full: delete the folder, or set WIW_CACHE to another" if free < 1 else ""
     if not os.access(there, os.W_OK):
         remedy = f"{there} is not writable: set WIW_CACHE to another folder"
@@ -145,12 +145,12 @@ def _cache() -> Finding:
     return Finding("scene cache", detail, remedy)
 
 
-def _free_gigabytes(folder: Path) -> float:
+def _count_free_gigabytes(folder: Path) -> float:
     disk = os.statvfs(folder)
     return disk.f_bavail * disk.f_frsize / 2**30
 
 
-def _version(package: str) -> str | None:
+def _find_version(package: str) -> str | None:
     try:
         return importlib.metadata.version(package)
     except importlib.metadata.PackageNotFoundError:

@@ -135,7 +135,7 @@ def prepare_run(
     from wiw.runs.recipes import arm_recipes
 
     seed = config.seed or 0
-    names = _arms(arms, parts.world_model)
+    names = _split_arms(arms, parts.world_model)
     policies = [parse_arm(name).model.partition("+")[0] for name in names or []]
     recipe, agent = rules.make_recipe(task, seed), parts.make_recipe(task, rules.preset, search, policies)
     folder = Path(config.out or Path("runs") / f"{task.rpartition(':')[2]}-{datetime.now():%Y%m%d-%H%M%S}")
@@ -208,7 +208,7 @@ def finish(log: Any, report: bool, remark: str = "") -> int:
     return 1 if numbers.invalid else 0
 
 
-def _arms(arms: str | None, world_model: str) -> list[str] | None:
+def _split_arms(arms: str | None, world_model: str) -> list[str] | None:
     from wiw.runs.arm_text import parse_arm, split_arms
     from wiw.runs.recipes import absolute, make_arm_absolute
 

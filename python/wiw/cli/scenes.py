@@ -51,7 +51,7 @@ def draw_scenes(
     rows = []
     for name in names:
         place = _load(name, backend)
-        table.add_row(*_facts(place))
+        table.add_row(*_list_facts(place))
         rows.append(place)
     Console().print(table)
     with atomic_file(out) as draft:
@@ -123,7 +123,7 @@ def _load(name: str, backend: Any) -> Any:
     return world(name, backend)
 
 
-def _facts(place: Any) -> list[str]:
+def _list_facts(place: Any) -> list[str]:
     from wiw.viz.contact_sheet import short_name
 
     scene, navmesh = place.scene, place.navmesh

@@ -44,7 +44,7 @@ def serve_vlm(
 
     secret = token or os.environ.get("WIW_TOKEN")
     with tempfile.TemporaryDirectory() as folder, ExitStack() as announcing:
-        server = VlmServer(_client(model, seed, folder), port, host, secret)
+        server = VlmServer(_make_client(model, seed, folder), port, host, secret)
         print(f"{server.client.model} at {server.url}", flush=True)
         if announce is not None:
             announcing.enter_context(announce_server(ServerAddress(server.url, secret), announce))
@@ -52,7 +52,7 @@ def serve_vlm(
     return 0
 
 
-def _client(model: str, seed: int, folder: str) -> Any:
+def _make_client(model: str, seed: int, folder: str) -> Any:
     from hashlib import blake2b
 
     from wiw.registry import Registry

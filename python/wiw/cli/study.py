@@ -125,8 +125,8 @@ def study_errors(
     task is left out and named.
 
     Writes errors.html, .svg, .png and .json into the folder, beside ordinary runs that hold a few episodes each, of all
-    arms. After Ctrl-C the same command goes on. Any run takes single errors as arms: `wiw run imagenav --arms
-    none,error-blur@16,oracle`. docs/errors.md has what came out here.
+    arms. After Ctrl-C the same command goes on, and with more kinds, doses or tasks it adds these. Any run takes single
+    errors as arms: `wiw run imagenav --arms none,error-blur@16,oracle`. docs/errors.md has what came out here.
 
     Args:
         out: New folder, or one that the same command began.

@@ -27,8 +27,8 @@ def run_study(
 
     Writes study.html, study.json, study.yaml (the file with its variables filled in) and an SVG of each figure. Each
     run is a folder beside them, which `wiw report` and `wiw compare` know as any other. After Ctrl-C the same command
-    goes on; a finished study only draws its page again. `wiw list studies` names the shipped ones, `wiw study --help`
-    shows how to write one.
+    goes on; a finished study only draws its page again, and one that has gained runs or arms runs these. `wiw list
+    studies` names the shipped ones, `wiw study --help` shows how to write one.
 
     Args:
         study: Name, or path of a YAML file.

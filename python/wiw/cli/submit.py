@@ -82,7 +82,10 @@ def submit(
     Shard(1, shards).select(count)
     serving = _write_servers(folder, parts, config.servers, jobs.cluster)
     if serving:
-        parts, arms = replace(parts, world_model=_remote(folder), world_model_option=()), _ask_servers(prepared, folder)
+        parts, arms = (
+            replace(parts, world_model=_name_servers(folder), world_model_option=()),
+            _ask_servers(prepared, folder),
+        )
     parted = [Shard(number, shards) for number in range(1, shards + 1)]
     commands = {shard: _write_command(task, arms, (parts, rules, search), prepared.settings, shard) for shard in parted}
     active = _require_alone(folder, [*serving, *commands.values()])
@@ -192,7 +195,7 @@ def _write_servers(folder: Path, parts: AgentFlags, count: int, cluster: str) ->
     ]
 
 
-def _remote(folder: Path) -> str:
+def _name_servers(folder: Path) -> str:
     return f"remote:{(folder / SERVERS).expanduser().resolve()}"
 
 
@@ -201,7 +204,7 @@ def _ask_servers(prepared: PreparedRun, folder: Path) -> str:
     from wiw.runs.arm_text import parse_arm
 
     own = str(prepared.agent.model)
-    served = f"{prepared.agent.arm}={_remote(folder)}"
+    served = f"{prepared.agent.arm}={_name_servers(folder)}"
     return ",".join(served if text == own else str(parse_arm(text)) for text in prepared.arms or [own])
 
 

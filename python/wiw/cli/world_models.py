@@ -33,18 +33,18 @@ def world_models(width: int) -> Any:
     from rich.console import Group
     from rich.text import Text
 
-    rows = [_row(name) for name in WORLD_MODELS.names()]
+    rows = [_make_row(name) for name in WORLD_MODELS.names()]
     widths = [max(map(len, column)) for column in zip(HEADS, *(row.cells for row in rows), strict=True)]
     spare = width - sum(widths) - GAP * (len(widths) - 1)
     widths[INPUT] = max(widths[INPUT] + min(spare, 0), len("perspective"))
-    lines = [_line(HEADS, widths, "bold"), _below(Text("weights, and what is missing on this machine", "bold"))]
+    lines = [_make_line(HEADS, widths, "bold"), _indent(Text("weights, and what is missing on this machine", "bold"))]
     for row in rows:
         said = Text.assemble((row.weights, "dim"), "  " if row.weights and row.status else "", (row.status, row.style))
-        lines += [_line(row.cells, widths), _below(said)]
+        lines += [_make_line(row.cells, widths), _indent(said)]
     return Group(*lines, Text(), Text(CAPTION, "dim"))
 
 
-def _line(cells: tuple[str, ...], widths: list[int], style: str = "") -> Any:
+def _make_line(cells: tuple[str, ...], widths: list[int], style: str = "") -> Any:
     from rich.table import Table
     from rich.text import Text
 
@@ -55,13 +55,13 @@ def _line(cells: tuple[str, ...], widths: list[int], style: str = "") -> Any:
     return line
 
 
-def _below(text: Any) -> Any:
+def _indent(text: Any) -> Any:
     from rich.padding import Padding
 
     return Padding(text, (0, 0, 0, GAP), expand=False)
 
 
-def _row(name: str) -> _Row:
+def _make_row(name: str) -> _Row:
     """Return the row of a registered model. Those that tell when they are made, such as a server's, have dashes."""
     from wiw.world_models.base import Accepts
     from wiw.world_models.status import lacks

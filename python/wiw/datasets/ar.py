@@ -21,6 +21,7 @@ from wiw._core import core
 from wiw.action import ActionSpace
 from wiw.datasets import episodes as episode_file
 from wiw.datasets import habitat
+from wiw.datasets.fields import to_position
 from wiw.datasets.visibility import COARSE, measure_sizes, measure_unoccluded_sizes
 from wiw.datasets.worlds import World
 from wiw.errors import ArgumentError, FileError
@@ -276,7 +277,7 @@ def _episode(
     if look == AVERTED_LOOK and front is None:
         return None
     for start, size, share in _starts(world, survey, instance, core.fold_key([key, 1]), rules, look):
-        if any(name == other.info["target"] and _triple(start) == other.start_position for other in made):
+        if any(name == other.info["target"] and to_position(start) == other.start_position for other in made):
             continue
         ahead = np.arctan2(-(centre - start)[0], -(centre - start)[2])
         yaw = float(ahead + np.radians(rules.turned) * (2 * draws[1] - 1)) % (2 * np.pi)
@@ -296,9 +297,9 @@ def _episode(
         return Episode(
             episode_id="",
             scene=world.name,
-            start_position=_triple(start),
+            start_position=to_position(start),
             start_yaw=yaw,
-            goal_position=_triple(centre),
+            goal_position=to_position(centre),
             goal_yaw=0.0,
             geodesic=float(world.navmesh.geodesic_distance(start, best.position)),
             info={
@@ -306,7 +307,7 @@ def _episode(
                 "category": category_of(instance),
                 "difficulty": sum(share < bound for bound in HIDDEN),
                 "visible": round(share, 4),
-                "best_position": _triple(best.position),
+                "best_position": to_position(best.position),
                 "best_primitives": best.primitives,
                 "best_visible": round(best.share, 4),
                 **({"first_look": reason, **angles} if rules.first_look == "balanced" else {}),
@@ -478,10 +479,6 @@ def _reachable(
 
 def _number_episode(episode: Episode, index: int) -> Episode:
     return replace(episode, episode_id=f"{index:04d}")
-
-
-def _triple(point: NDArray[np.float64]) -> tuple[float, float, float]:
-    return float(point[0]), float(point[1]), float(point[2])
 
 
 def load(

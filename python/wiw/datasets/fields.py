@@ -4,7 +4,10 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from typing import Any
+
+from numpy.typing import NDArray
 
 
 def text(value: Any, name: str) -> str:
@@ -31,6 +34,11 @@ def integer(value: Any, name: str) -> int:
     if number(value, name) != int(value) or value < 0:
         raise ValueError(f"{name}: expected an integer of at least 0, got {value!r:.80}")
     return int(value)
+
+
+def to_position(point: NDArray[Any] | Sequence[float]) -> tuple[float, float, float]:
+    """Return [x, y, z] as Python's floats, as episodes have them."""
+    return float(point[0]), float(point[1]), float(point[2])
 
 
 def point(value: Any, name: str) -> tuple[float, float, float]:

@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 
 from wiw._core import core
 from wiw.datasets.cameras import camera_pose, is_in_view
+from wiw.datasets.fields import to_position
 from wiw.datasets.ways_on import NO_FORK, SEEN_AROUND, TWO_CORNERS, find_broken_rule
 from wiw.datasets.worlds import World
 from wiw.errors import ArgumentError, EpisodesError
@@ -162,9 +163,9 @@ def _episode(world: World, index: int, seed: int, rules: EpisodeRules, tier: str
         return Episode(
             episode_id=f"{index:04d}",
             scene=world.name,
-            start_position=_triple(start),
+            start_position=to_position(start),
             start_yaw=start_yaw,
-            goal_position=_triple(goal),
+            goal_position=to_position(goal),
             goal_yaw=goal_yaw,
             geodesic=geodesic,
             info={"ideal_primitives": ideal, **({"tier": tier} if tier else {})},
@@ -208,7 +209,3 @@ def _best_view(world: World, goal: NDArray[np.float64], yaws: NDArray[np.float64
     depths[things < rules.goal_instances] = 0
     best = int(depths.argmax())
     return float(yaws[best]) if depths[best] >= rules.goal_depth else None
-
-
-def _triple(point: NDArray[np.float64]) -> tuple[float, float, float]:
-    return float(point[0]), float(point[1]), float(point[2])

@@ -126,7 +126,7 @@ def _replay(
     if lpips is not None:
         view = FrameSpec("front" if batch.imagined.view == "perspective" else "surround", PERSPECTIVE)
         shown, truths = batch.imagined.show(view), true.show(view)
-        distances = _distances(lpips, [shown[place] for place in places], truths)
+        distances = _measure_distances(lpips, [shown[place] for place in places], truths)
     known = batch.imagined.pose_errors
     misplaced = [None if known is None else known[place] for place in places]
     found = zip(queries, rollouts, scores, distances, misplaced, strict=True)
@@ -143,7 +143,7 @@ def _view_of(rollout: Rollout, ends: bool, source_size: tuple[int, int] | None) 
 
 
 def _compare(imagined: Sequence[Rollout], scores: NDArray[np.float64], truth: _Truth) -> Fidelity:
-    errors = np.array([_errors(one, other) for one, other in zip(imagined, truth.rollouts, strict=True)])
+    errors = np.array([_measure_errors(one, other) for one, other in zip(imagined, truth.rollouts, strict=True)])
     agreement = rank_agreement(scores, truth.scores)
     return Fidelity(
         tuple(truth.rollouts),
@@ -156,7 +156,7 @@ def _compare(imagined: Sequence[Rollout], scores: NDArray[np.float64], truth: _T
     )
 
 
-def _errors(imagined: Rollout, true: Rollout) -> tuple[float, float]:
+def _measure_errors(imagined: Rollout, true: Rollout) -> tuple[float, float]:
     """Return mean PSNR and SSIM over the frames that were imagined; NaN where all are the real view turned."""
     made = ~imagined.real
     if not made.any():
@@ -166,16 +166,16 @@ def _errors(imagined: Rollout, true: Rollout) -> tuple[float, float]:
     return float(np.mean(psnr(frames, truth, weights=weights))), float(np.mean(ssim(frames, truth, weights=weights)))
 
 
-def _distances(
+def _measure_distances(
     lpips: Lpips, imagined: Sequence[Sequence[Rollout]], true: Sequence[Sequence[Rollout]]
 ) -> list[NDArray[np.float64]]:
     """Return the mean LPIPS over the imagined frames of each plan, float64 [M] per episode; NaN without any."""
     return [
-        np.array([_distance(lpips, one, other) for one, other in zip(plans, truths, strict=True)])
+        np.array([_measure_distance(lpips, one, other) for one, other in zip(plans, truths, strict=True)])
         for plans, truths in zip(imagined, true, strict=True)
     ]
 
 
-def _distance(lpips: Lpips, imagined: Rollout, true: Rollout) -> float:
+def _measure_distance(lpips: Lpips, imagined: Rollout, true: Rollout) -> float:
     made = ~imagined.real
     return float(np.mean(lpips(imagined.frames[made], true.frames[made]))) if made.any() else math.nan

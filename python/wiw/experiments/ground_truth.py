@@ -98,7 +98,9 @@ class TrueScores(_Guided):
     ) -> list[NDArray[np.float64]]:
         """Let the wrapped reviser score and remember, and return the true worth of each plan."""
         super().score_or_prefer(situations, proposals, rollouts)
-        return [self._worths(situation.key, plans) for situation, plans in zip(situations, proposals, strict=True)]
+        return [
+            self._measure_worths(situation.key, plans) for situation, plans in zip(situations, proposals, strict=True)
+        ]
 
     def revise(
         self, situation: Situation, proposals: Sequence[Proposal], scores: NDArray[np.float64]
@@ -108,7 +110,7 @@ class TrueScores(_Guided):
         best = int(np.argmax(scores))
         return proposals[best].actions, best
 
-    def _worths(self, key: Key, plans: Sequence[Proposal]) -> NDArray[np.float64]:
+    def _measure_worths(self, key: Key, plans: Sequence[Proposal]) -> NDArray[np.float64]:
         guide = self._guide(key)
         parts = [plan.actions[: self._count_executed(len(plan.actions))] for plan in plans]
         return np.array([guide.evaluate_plan(part) for part in parts], np.float64)

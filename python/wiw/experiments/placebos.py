@@ -145,7 +145,7 @@ def shuffle(plans: Sequence[Proposal], key: Key, spec: planner.ModelSpec) -> lis
     """
     pool = np.concatenate([plan.actions for plan in plans])
     movable = np.flatnonzero(pool != STOP)
-    wanted = _cost([plan.actions for plan in plans], spec)
+    wanted = _count_cost([plan.actions for plan in plans], spec)
     ends = np.cumsum([len(plan.actions) for plan in plans])[:-1]
     best: tuple[tuple[int, int], list[NDArray[np.int8]]] | None = None
     for draw in range(DRAWS):
@@ -153,7 +153,7 @@ def shuffle(plans: Sequence[Proposal], key: Key, spec: planner.ModelSpec) -> lis
         dealt = pool.copy()
         dealt[movable] = pool[movable[np.argsort(core.uniform(key_of_draw, len(movable)))]]
         made = np.split(dealt, ends)
-        rows, frames = _cost(made, spec)
+        rows, frames = _count_cost(made, spec)
         miss = abs(rows - wanted[0]), abs(frames - wanted[1])
         if best is None or miss < best[0]:
             best = miss, made
@@ -163,7 +163,7 @@ def shuffle(plans: Sequence[Proposal], key: Key, spec: planner.ModelSpec) -> lis
     return [Proposal(actions, plan.prior, plan.note) for actions, plan in zip(best[1], plans, strict=True)]
 
 
-def _cost(plans: Sequence[NDArray[np.int8]], spec: planner.ModelSpec) -> tuple[int, int]:
+def _count_cost(plans: Sequence[NDArray[np.int8]], spec: planner.ModelSpec) -> tuple[int, int]:
     """Return the rollouts and frames that plans of one episode ask of a model."""
     batch = planner.Batch.build([list(plans)], spec)
     return len(batch.row_length), int((batch.row_length - batch.row_shared).sum())

@@ -79,7 +79,8 @@ class IsolatedModel(Isolated, WorldModel):
 
     Args:
         isolate: False makes the model in this process instead, and returns it itself.
-        memory_gb: most gigabytes of memory that its process may take; three quarters of the machine's if not given.
+        memory_gb: most gigabytes of memory that its process may take, without those that it starts; three quarters of
+            the machine's if not given.
         options: what the model is made with.
 
     Raises:

@@ -69,7 +69,8 @@ class IsolatedPolicy(Isolated, Policy):
     A call that fails or is late loses all memories: its episodes end with errors, or begin anew.
 
     Args:
-        memory_gb: most gigabytes of memory that its process may take; three quarters of the machine's if not given.
+        memory_gb: most gigabytes of memory that its process may take, without those that it starts; three quarters of
+            the machine's if not given.
         deadline: most seconds for a call.
         options: what the policy is made with.
 

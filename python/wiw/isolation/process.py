@@ -30,13 +30,12 @@ import msgpack
 import numpy as np
 from numpy.typing import NDArray
 
-import wiw
 from wiw import errors
 from wiw.errors import InfrastructureError
 from wiw.isolation.connection import receive, send
 from wiw.isolation.failures import EndedError, ExitError, LateError, RaisedError
 from wiw.isolation.segments import Segment, SegmentPool, place
-from wiw.process_limits import find_memory_limit
+from wiw.process_limits import find_memory_limit, make_child_environment
 
 STARTING = 120.0
 """Seconds in which a child has to be there; it takes half of one on an idle machine."""
@@ -51,7 +50,7 @@ class ChildProcess:
 
     Args:
         memory_gb: most gigabytes of memory that it may take, looked at while it computes; None means three quarters of
-            the machine's.
+            the machine's. Processes that it starts are not counted: after a fork they seem to take what they share.
     """
 
     def __init__(self, memory_gb: float | None = None) -> None:
@@ -187,7 +186,8 @@ class ChildProcess:
     def _await_reply(self, until: float | None) -> None:
         """Wait for the begin of a reply, with a look at the child's memory now and then.
 
-        A limit of the kernel's would also count what the driver of a GPU merely reserves.
+        A limit of the kernel's would also count what the driver of a GPU merely reserves. Neither counts what the
+        child's own children take.
 
         Raises:
             TimeoutError: there is none in time.
@@ -249,15 +249,8 @@ def _open(command: list[str], descriptor: int) -> subprocess.Popen[bytes]:
         stdout=2,
         pass_fds=(descriptor,),
         start_new_session=True,
-        env=_environment(),
+        env=make_child_environment(),
     )
-
-
-def _environment() -> dict[str, str]:
-    """Return our own environment, with this very package first on the child's path."""
-    here = str(Path(wiw.__file__).parents[1])
-    paths = [here, *filter(None, os.environ.get("PYTHONPATH", "").split(os.pathsep))]
-    return {**os.environ, "PYTHONPATH": os.pathsep.join(paths)}
 
 
 def _end(process: subprocess.Popen[bytes], connection: socket.socket) -> None:

@@ -83,7 +83,8 @@ class Isolated:
     """Base of what stands for a part in a process of its own; where that has ended, another one is begun.
 
     Args:
-        memory_gb: most gigabytes of memory that a process may take; three quarters of the machine's if None.
+        memory_gb: most gigabytes of memory that a process may take, without those that it starts; three quarters of
+            the machine's if None.
     """
 
     source: ClassVar[Source]

@@ -11,6 +11,7 @@ from typing import Annotated, Any
 from tyro.conf import Suppress, arg
 
 from wiw.errors import ArgumentError
+from wiw.typed_values import require_known
 
 DESCRIBED = ("candidates", "horizon", "execute", "depth", "width")
 
@@ -114,7 +115,5 @@ def set_numbers(config: AgentConfig, numbers: Mapping[str, Any]) -> AgentConfig:
     Raises:
         ArgumentError: a name that is no number of the search.
     """
-    known = [field.name for field in fields(AgentConfig)]
-    if unknown := [name for name in numbers if name not in known]:
-        raise ArgumentError(f"agent: unknown option {', '.join(unknown)}; there are {', '.join(known)}")
+    require_known(numbers, [field.name for field in fields(AgentConfig)], "agent", "option")
     return replace(config, **numbers)

@@ -173,7 +173,7 @@ class DecisionPass:
         actions, chosen = self._choose(episode, plans, scores)
         execute = self._parts.config.count_executed(len(actions))
         self._parts.memories.record(query.key, actions[:execute])
-        exchanges = tuple(each for policy in self._policies() for each in policy.exchanges(query.key))
+        exchanges = tuple(each for policy in self._list_policies() for each in policy.exchanges(query.key))
         decision = Decision(
             actions=actions,
             execute=execute,
@@ -199,7 +199,7 @@ class DecisionPass:
     def _add_pictures(self, episode: int, decision: Decision, north: float) -> Decision:
         """Let the policies draw what they believe. Of pictures of one name that of the reviser is kept."""
         pictures: dict[str, NDArray[np.uint8]] = {}
-        for policy, situations in zip(self._policies(), (self._proposing, self._revising), strict=False):
+        for policy, situations in zip(self._list_policies(), (self._proposing, self._revising), strict=False):
             pictures |= check_pictures(policy, policy.draw(situations[episode], decision, north))
         return replace(decision, pictures=pictures)
 
@@ -211,6 +211,6 @@ class DecisionPass:
         source = f"{type(reviser.unwrapped).__name__}.revise"
         return self._parts.space.check_plan(source, actions, config.longest), chosen
 
-    def _policies(self) -> list[Policy]:
+    def _list_policies(self) -> list[Policy]:
         policy, reviser = self._parts.policy, self._parts.reviser
         return [policy] if reviser.unwrapped is policy.unwrapped else [policy, reviser]

@@ -140,20 +140,20 @@ class RowHistories:
 
     def before(self, part: Any, answers: Sequence[NDArray[np.uint8]]) -> History:
         """Return the histories of a call's rows, imagined frames of earlier calls included."""
-        return stack_histories([self._frames(int(row), part.first, answers) for row in part.rows], self._most)
+        return stack_histories([self._list_frames(int(row), part.first, answers) for row in part.rows], self._most)
 
-    def _frames(self, row: int, first: int, answers: Sequence[NDArray[np.uint8]]) -> Sequence[Frame]:
+    def _list_frames(self, row: int, first: int, answers: Sequence[NDArray[np.uint8]]) -> Sequence[Frame]:
         if first == 0:
             return self._starts[row]
         actions = self._actions[row][:first]
         poses = to_trajectory(actions)
         imagined = [
-            Frame(self._image(row, k, answers), poses[k - 1], actions[k - 1 : k])
+            Frame(self._get_image(row, k, answers), poses[k - 1], actions[k - 1 : k])
             for k in range(max(1, first - self._most + 1), first + 1)
         ]
         return [*self._starts[row], *imagined]
 
-    def _image(self, row: int, frame: int, answers: Sequence[NDArray[np.uint8]]) -> NDArray[np.uint8]:
+    def _get_image(self, row: int, frame: int, answers: Sequence[NDArray[np.uint8]]) -> NDArray[np.uint8]:
         """Return an imagined frame of a row; where rows share it, it stands in the answer to the first of them."""
         while frame <= self._shared[row]:
             row = int(self._parents[row])

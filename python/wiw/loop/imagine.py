@@ -67,25 +67,25 @@ def imagine_primitives(model: WorldModel, request: Request) -> ImaginedPrimitive
         plans = [[plan.actions for plan in own] for own in request.plans]
         batch = planner.Batch.build(plans, make_model_spec(accepts, request.frames.ends))
         panoramas = [observation.panorama for observation in request.observations]
-        parts, conditioning = batch.parts, _conditioning(accepts, batch, request.inputs)
+        parts, conditioning = batch.parts, _build_conditioning(accepts, batch, request.inputs)
         histories = None
         if accepts.history:
             flat = [actions for own in plans for actions in own]
             histories = RowHistories(accepts, batch, parts, flat, request.inputs, conditioning.image)
-        seeds = _seeds(accepts, batch, request.keys, request.origins)
+        seeds = _draw_seeds(accepts, batch, request.keys, request.origins)
     answers: list[NDArray[np.uint8]] = []
     for part in parts:
         with clock("platform"):
-            observations = _at_start(conditioning, part, answers, accepts)
+            observations = _select_starts(conditioning, part, answers, accepts)
             if histories is not None:
                 observations = replace(observations, history=histories.before(part, answers))
-            controls = _controls(accepts, part, request.wordless)
+            controls = _make_controls(accepts, part, request.wordless)
         with clock("world_model"):
             found = ask(model, observations, controls, seeds[part.rows])
             answers.append(_require_own_memory(found, answers, model))
     with clock("platform"):
         rollouts = _show(batch, panoramas, answers, accepts.view, request.frames)
-        costs = _cost(batch, len(request.keys))
+        costs = _count_cost(batch, len(request.keys))
         source_size = accepts.size if model.accepts.is_scalable else None
         return ImaginedPrimitives(rollouts, costs, request.observations, batch, answers, accepts.view, source_size)
 
@@ -109,13 +109,13 @@ def make_model_spec(accepts: Accepts, ends: bool = False) -> Any:
     return planner.ModelSpec(causal=accepts.causal, frames=accepts.frames, max_rows=accepts.best_batch, ends=ends)
 
 
-def _conditioning(accepts: Accepts, batch: Any, inputs: Sequence[ModelInput]) -> Conditioning:
+def _build_conditioning(accepts: Accepts, batch: Any, inputs: Sequence[ModelInput]) -> Conditioning:
     """Build each row's start: the real observation after the plan's leading turns, in the model's view and size."""
     maker = maker_of(accepts)
     depth = simulators = None
     if "depth" in accepts.needs:
         depth = batch.depths(list_depths(inputs), maker)
-    semantic = _labels(accepts, batch, inputs) if "semantic" in accepts.needs else None
+    semantic = _label_starts(accepts, batch, inputs) if "semantic" in accepts.needs else None
     if "simulator" in accepts.needs:
         simulators = [
             _turn(inputs[e].simulator, turns) for e, turns in zip(batch.row_episode, batch.row_turns, strict=True)
@@ -124,7 +124,7 @@ def _conditioning(accepts: Accepts, batch: Any, inputs: Sequence[ModelInput]) ->
     return Conditioning(batch.observations(panoramas, maker), depth=depth, semantic=semantic, simulators=simulators)
 
 
-def _labels(accepts: Accepts, batch: Any, inputs: Sequence[ModelInput]) -> NDArray[np.uint32]:
+def _label_starts(accepts: Accepts, batch: Any, inputs: Sequence[ModelInput]) -> NDArray[np.uint32]:
     """Return the labels of what each row begins with, none of them blended.
 
     Raises:
@@ -152,7 +152,9 @@ def _turn(simulator: Any, turns: int) -> Any:
     return fork
 
 
-def _at_start(whole: Conditioning, part: Any, answers: Sequence[NDArray[np.uint8]], accepts: Accepts) -> Conditioning:
+def _select_starts(
+    whole: Conditioning, part: Any, answers: Sequence[NDArray[np.uint8]], accepts: Accepts
+) -> Conditioning:
     """Return the rows of one call; a call that continues a long plan begins at the frame where the one before ended."""
     if part.first == 0:
         rows = _slice_of(part.rows)
@@ -181,7 +183,7 @@ def _slice_of(rows: NDArray[np.int64]) -> slice | NDArray[np.int64]:
     return slice(first, last + 1) if last - first + 1 == len(rows) else rows
 
 
-def _controls(accepts: Accepts, part: Any, wordless: bool) -> list[Control]:
+def _make_controls(accepts: Accepts, part: Any, wordless: bool) -> list[Control]:
     tells = accepts.control == "text" and not wordless
     return [
         Control(
@@ -189,7 +191,7 @@ def _controls(accepts: Accepts, part: Any, wordless: bool) -> list[Control]:
             trajectory=trajectory,
             viewpoints=viewpoints,
             text=action.to_text(actions[:length], accepts.template) if tells else "",
-            ids=_ids(accepts, actions),
+            ids=_get_action_ids(accepts, actions),
             length=int(length),
             shared=int(shared),
         )
@@ -199,7 +201,7 @@ def _controls(accepts: Accepts, part: Any, wordless: bool) -> list[Control]:
     ]
 
 
-def _ids(accepts: Accepts, actions: NDArray[np.int8]) -> NDArray[Any] | None:
+def _get_action_ids(accepts: Accepts, actions: NDArray[np.int8]) -> NDArray[Any] | None:
     if accepts.control != "action":
         return None
     primitives = action.with_null(actions) if accepts.null_first else actions
@@ -223,7 +225,9 @@ def list_depths(inputs: Sequence[ModelInput]) -> list[NDArray[np.float32]]:
     return depths
 
 
-def _seeds(accepts: Accepts, batch: Any, keys: Sequence[Key], origins: Sequence[Sequence[int]]) -> NDArray[np.uint64]:
+def _draw_seeds(
+    accepts: Accepts, batch: Any, keys: Sequence[Key], origins: Sequence[Sequence[int]]
+) -> NDArray[np.uint64]:
     """Return uint64 [rows], keyed by (episode, decision, candidate), whatever else is in the batch; 0 without seeds."""
     if not accepts.seeded:
         return np.zeros(len(batch.row_owner), np.uint64)
@@ -231,7 +235,7 @@ def _seeds(accepts: Accepts, batch: Any, keys: Sequence[Key], origins: Sequence[
     return np.array(seeds, np.uint64)[batch.row_owner]
 
 
-def _cost(batch: Any, episodes: int) -> list[dict[str, int]]:
+def _count_cost(batch: Any, episodes: int) -> list[dict[str, int]]:
     """Count rows asked of the world model for each episode and frames of them that no other row answers."""
     rows = np.bincount(batch.row_episode, minlength=episodes)
     frames = np.bincount(batch.row_episode, batch.row_length - batch.row_shared, minlength=episodes)

@@ -40,7 +40,7 @@ class ImaginedPoses(Imagination):
 
     def show(self, frames: FrameSpec) -> list[list[Rollout]]:
         """Return the rollouts in another size."""
-        return [[_rollout(own, frames.size) for own in plans] for plans in self.frames]
+        return [[_make_rollout(own, frames.size) for own in plans] for plans in self.frames]
 
 
 @dataclass(frozen=True)
@@ -57,23 +57,23 @@ def imagine_poses(model: WorldModel, request: Request) -> ImaginedPoses:
     """Imagine every plan of every episode, equal ones of an episode once; see `wiw.loop.imagine`."""
     accepts, clock = model.accepts, request.clock
     with clock("platform"):
-        rows, places = _rows(accepts, request)
+        rows, places = _list_rows(accepts, request)
     answers: list[NDArray[np.uint8]] = [np.empty(0, np.uint8)] * len(rows)
-    for part in _parts(rows, accepts.best_batch):
+    for part in _split_rows(rows, accepts.best_batch):
         with clock("platform"):
-            observations = _conditioning(accepts, [request.inputs[rows[i].episode] for i in part])
+            observations = _build_conditioning(accepts, [request.inputs[rows[i].episode] for i in part])
             seeds = np.array([rows[i].seed for i in part], np.uint64)
         with clock("world_model"):
             found = ask(model, observations, [rows[i].control for i in part], seeds)
         for i, own in zip(part, found, strict=True):
-            answers[i] = own[_frames_of(rows[i])]
+            answers[i] = own[_find_frames(rows[i])]
     with clock("platform"):
         made = [[answers[place] for place in plans] for plans in places]
-        rollouts = [[_rollout(own, request.frames.size) for own in plans] for plans in made]
-        return ImaginedPoses(rollouts, _cost(rows, len(request.keys)), made)
+        rollouts = [[_make_rollout(own, request.frames.size) for own in plans] for plans in made]
+        return ImaginedPoses(rollouts, _count_cost(rows, len(request.keys)), made)
 
 
-def _rows(accepts: Accepts, request: Request) -> tuple[list[_Row], list[list[int]]]:
+def _list_rows(accepts: Accepts, request: Request) -> tuple[list[_Row], list[list[int]]]:
     """Return the rollouts to request, and for each episode's plans their indices among them."""
     rows: list[_Row] = []
     places: list[list[int]] = []
@@ -84,13 +84,13 @@ def _rows(accepts: Accepts, request: Request) -> tuple[list[_Row], list[list[int
             if name not in known:
                 known[name] = len(rows)
                 seed = seed_of(request.keys[episode], number) if accepts.seeded else 0
-                control = _control(accepts, plan, request.observations[episode].pose, request.wordless)
+                control = _make_control(accepts, plan, request.observations[episode].pose, request.wordless)
                 rows.append(_Row(episode, plan.actions, control, seed))
         places.append([known[plan.actions.tobytes(), plan.text] for plan in plans])
     return rows, places
 
 
-def _control(accepts: Accepts, plan: Proposal, here: NDArray[np.float64], wordless: bool) -> Control:
+def _make_control(accepts: Accepts, plan: Proposal, here: NDArray[np.float64], wordless: bool) -> Control:
     """Return the plan at the length that the model imagines, or at its own."""
     tells = accepts.control == "text" and not wordless
     poses = plan.actions
@@ -107,7 +107,7 @@ def _control(accepts: Accepts, plan: Proposal, here: NDArray[np.float64], wordle
     )
 
 
-def _parts(rows: Sequence[_Row], most: int) -> Iterator[list[int]]:
+def _split_rows(rows: Sequence[_Row], most: int) -> Iterator[list[int]]:
     """Return rows of equal length, in calls of at most `most`."""
     order = sorted(range(len(rows)), key=lambda i: rows[i].control.length)
     for _, same in groupby(order, key=lambda i: rows[i].control.length):
@@ -116,7 +116,7 @@ def _parts(rows: Sequence[_Row], most: int) -> Iterator[list[int]]:
             yield places[first : first + most]
 
 
-def _conditioning(accepts: Accepts, inputs: Sequence[ModelInput]) -> Conditioning:
+def _build_conditioning(accepts: Accepts, inputs: Sequence[ModelInput]) -> Conditioning:
     depth = simulators = None
     if "depth" in accepts.needs:
         depth = np.stack([resize(value, accepts.size, cv2.INTER_NEAREST) for value in list_depths(inputs)])
@@ -129,17 +129,17 @@ def _conditioning(accepts: Accepts, inputs: Sequence[ModelInput]) -> Conditionin
     return Conditioning(image, depth=depth, history=history, simulators=simulators)
 
 
-def _frames_of(row: _Row) -> NDArray[np.int64]:
+def _find_frames(row: _Row) -> NDArray[np.int64]:
     """int64 [K]: the frame of a rollout at which the gripper has come to each pose of the plan."""
     return action.frames_of_actions(len(row.plan), row.control.length + 1, "resample")[:, 1]
 
 
-def _rollout(frames: NDArray[np.uint8], size: tuple[int, int]) -> Rollout:
+def _make_rollout(frames: NDArray[np.uint8], size: tuple[int, int]) -> Rollout:
     shown = np.stack([resize(frame, size) for frame in frames])
     return Rollout(shown, np.zeros(len(frames), np.bool_), "front")
 
 
-def _cost(rows: Sequence[_Row], episodes: int) -> list[dict[str, int]]:
+def _count_cost(rows: Sequence[_Row], episodes: int) -> list[dict[str, int]]:
     counts = [{"consultations": 1, "rows": 0, "frames": 0} for _ in range(episodes)]
     for row in rows:
         counts[row.episode]["rows"] += 1

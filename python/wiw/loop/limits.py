@@ -60,11 +60,11 @@ class Limits:
         """Return the limits for the run store, the same in any folder; `Limits(**...)` is the way back."""
         own = {name: getattr(self, name) for name in Limits.__dataclass_fields__}
         own["deadline"] = min(self.deadline, NO_DEADLINE)
-        own["cache"], own["lpips"] = _anywhere(self.cache), _anywhere(self.lpips)
+        own["cache"], own["lpips"] = _make_absolute(self.cache), _make_absolute(self.lpips)
         return own
 
 
-def _anywhere(folder: str | Path | None) -> str | None:
+def _make_absolute(folder: str | Path | None) -> str | None:
     """Return a folder so that it means the same anywhere, and words that stand for one as they are."""
     if folder is None or str(folder) in ("auto", "off"):
         return None if folder is None else str(folder)

@@ -67,7 +67,7 @@ class RolloutCache:
 
     def get(self, key: str, first: int, frames: NDArray[np.uint8]) -> bool:
         """Fill `frames` [K, H, W, 3] with frames `first`... of an entry; False where none matches."""
-        path = self._path(key)
+        path = self._find_path(key)
         try:
             with path.open("rb", buffering=0) as file:
                 found = self._read(file, first, frames)
@@ -90,7 +90,7 @@ class RolloutCache:
         if not self._writing or size > self.budget:
             return
         start = struct.pack("<8s5I", _MAGIC, first, *data.shape[:3], zlib.crc32(data.data))
-        path = self._path(key)
+        path = self._find_path(key)
         draft = path.with_suffix(f".{uuid.uuid4().hex}.draft")
         try:
             path.parent.mkdir(parents=True, exist_ok=True)
@@ -108,7 +108,7 @@ class RolloutCache:
         if self._known is None or self._known + self._written > self.budget or self._written > self.budget // 20:
             self._trim()
 
-    def _path(self, key: str) -> Path:
+    def _find_path(self, key: str) -> Path:
         return self.folder / key[:2] / f"{key[2:]}.frames"
 
     def _read(self, file: Any, first: int, frames: NDArray[np.uint8]) -> bool:
@@ -136,7 +136,7 @@ class RolloutCache:
         self.folder.mkdir(parents=True, exist_ok=True)
         with (self.folder / ".lock").open("w") as lock:
             fcntl.flock(lock, fcntl.LOCK_EX)
-            entries = self._entries()
+            entries = self._list_entries()
             total = sum(size for _, size, _ in entries)
             for _, size, path in sorted(entries) if total > self.budget else ():
                 if total <= 0.9 * self.budget:
@@ -146,7 +146,7 @@ class RolloutCache:
                 total -= size
         self._known, self._written = total, 0
 
-    def _entries(self) -> list[tuple[int, int, str]]:
+    def _list_entries(self) -> list[tuple[int, int, str]]:
         """Return last use, bytes and path of each file; drafts that a dead process left behind go after an hour."""
         found = []
         for folder in os.scandir(self.folder):
@@ -178,7 +178,7 @@ class Cached(ModelWrapper):
         self, observations: Conditioning, controls: Sequence[Control], seeds: NDArray[np.uint64]
     ) -> NDArray[np.uint8]:
         """Return frames as `WorldModel.rollout` promises them; those that are never read may be left unwritten."""
-        keys = [_key(self._identity, observations, row, control, seeds) for row, control in enumerate(controls)]
+        keys = [_make_key(self._identity, observations, row, control, seeds) for row, control in enumerate(controls)]
         own = [(1 + control.shared, 1 + control.length) for control in controls]
         frames = np.empty((len(controls), 1 + len(controls[0].actions), *observations.image.shape[1:]), np.uint8)
         with time_separately("cache"):
@@ -190,7 +190,9 @@ class Cached(ModelWrapper):
             ]
         self._cached_rows += len(controls) - len(missing)
         if missing:
-            fresh = self.model.rollout(_rows(observations, missing), [controls[row] for row in missing], seeds[missing])
+            fresh = self.model.rollout(
+                _select_rows(observations, missing), [controls[row] for row in missing], seeds[missing]
+            )
             with time_separately("cache"):
                 for answer, row in zip(fresh, missing, strict=True):
                     first, end = own[row]
@@ -224,7 +226,9 @@ def _warn_unversioned(name: str) -> None:
     )
 
 
-def _key(identity: bytes, observations: Conditioning, row: int, control: Control, seeds: NDArray[np.uint64]) -> str:
+def _make_key(
+    identity: bytes, observations: Conditioning, row: int, control: Control, seeds: NDArray[np.uint64]
+) -> str:
     digest = blake2b(identity, digest_size=20)
     parts: list[Any] = [observations.image[row], control.actions, control.trajectory, control.viewpoints, seeds[row]]
     parts += [values[row] for values in (observations.depth, observations.semantic) if values is not None]
@@ -241,7 +245,7 @@ def _key(identity: bytes, observations: Conditioning, row: int, control: Control
     return digest.hexdigest()
 
 
-def _rows(whole: Conditioning, rows: Sequence[int]) -> Conditioning:
+def _select_rows(whole: Conditioning, rows: Sequence[int]) -> Conditioning:
     """Return some rows of a batch; the batch itself where it is all of them."""
     if len(rows) == len(whole):
         return whole

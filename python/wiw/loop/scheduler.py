@@ -154,7 +154,7 @@ def _advance(agent: Agent, running: list[LiveEpisode], sink: Sink) -> list[tuple
     except BaseException as error:
         if is_stop_request(error):
             raise
-        kind = _kind(error)
+        kind = _classify_error(error)
         sink.record_lost({**(agent.count_spent() - before), "seconds": time.perf_counter() - begin})
         for each in running:
             each.done = True
@@ -188,7 +188,7 @@ def _hand_over(decisions: list[Decision]) -> Iterator[Decision]:
         yield decisions.pop()
 
 
-def _kind(error: BaseException) -> str:
+def _classify_error(error: BaseException) -> str:
     if isinstance(error, RolloutError):
         return f"world_model/{error.kind}"
     return f"vlm/{error.kind}" if isinstance(error, VlmError) else "agent"

@@ -61,22 +61,22 @@ class Search:
 
         The prior of a longer plan is the sum of its parts'. Episodes of which nothing was imagined keep their plans.
         """
-        kept = [_best(own, self._config.width) if futures.rollouts[e] else [] for e, own in enumerate(scores)]
+        kept = [_choose_best(own, self._config.width) if futures.rollouts[e] else [] for e, own in enumerate(scores)]
         going = [(e, c) for e, order in enumerate(kept) for c in order if STOP not in self.plans[e][c].actions]
-        more = self._continuations(policy, situations, futures, going)
+        more = self._propose_continuations(policy, situations, futures, going)
         for episode, order in enumerate(kept):
             if order:
                 self._replace(episode, [(c, plan) for c in order for plan in more.get((episode, c)) or [_NO_MORE]])
         self.level += 1
 
-    def _continuations(
+    def _propose_continuations(
         self, policy: Policy, situations: Sequence[Situation], futures: Imagination, going: list[tuple[int, int]]
     ) -> dict[tuple[int, int], Sequence[Proposal]]:
         """Return what the policy proposes at the ends of the (episode, candidate) plans `going`."""
         if not going:
             return {}
         candidates, horizon = self._config.candidates or 1, self._config.horizon or 1
-        found = policy.extend(self._at_ends(situations, futures, going), candidates, horizon)
+        found = policy.extend(self._move_to_ends(situations, futures, going), candidates, horizon)
         check_continuations(policy, self._space, found, len(going), candidates, horizon)
         return dict(zip(going, found, strict=True))
 
@@ -85,7 +85,7 @@ class Search:
         self.plans[episode] = [_join(old[c], more) for c, more in pairs]
         self.origins[episode] = [origins[c] for c, _ in pairs]
 
-    def _at_ends(
+    def _move_to_ends(
         self, situations: Sequence[Situation], futures: Imagination, going: Sequence[tuple[int, int]]
     ) -> list[Situation]:
         """Return the episodes' situations at the ends of the (episode, candidate) plans `going`."""
@@ -100,7 +100,7 @@ class Search:
         return ends
 
 
-def _best(scores: NDArray[np.float64], width: int | None) -> list[int]:
+def _choose_best(scores: NDArray[np.float64], width: int | None) -> list[int]:
     """Return the candidates with the highest scores, best first; equal scores keep their order."""
     return [int(c) for c in np.argsort(-scores, kind="stable")[:width]]
 

@@ -23,11 +23,11 @@ GAP = 3
 
 def panorama(jpeg: bytes, width: int, quality: int, scale: float = 1.0) -> bytes:
     """Return the band of a panorama that pages show, at most `width` pixels wide."""
-    band = part(decode_jpeg(jpeg), BAND, (0, 1))
+    band = cut_part(decode_jpeg(jpeg), BAND, (0, 1))
     return _shrink(band, scale * min(1, width / band.shape[1]), quality)
 
 
-def front(jpeg: bytes, side: int, quality: int, scale: float = 1.0) -> bytes:
+def cut_front(jpeg: bytes, side: int, quality: int, scale: float = 1.0) -> bytes:
     """Return a camera image, at most `side` pixels wide."""
     image = decode_jpeg(jpeg)
     return _shrink(image, scale * min(1, side / image.shape[1]), quality)
@@ -37,13 +37,13 @@ def strip(jpeg: bytes, count: int, height: int, quality: int, scale: float = 1.0
     """Return frames side by side, at most `height` pixels high; of panoramas only the part in front of the agent."""
     tiles = np.split(decode_jpeg(jpeg), count, axis=1)
     if tiles[0].shape[1] > 1.6 * tiles[0].shape[0]:
-        tiles = [part(tile, BAND, FRONT) for tile in tiles]
+        tiles = [cut_part(tile, BAND, FRONT) for tile in tiles]
     gap = np.full((len(tiles[0]), GAP, 3), 255, np.uint8)
     spaced = np.concatenate([own for tile in tiles for own in (tile, gap)][:-1], axis=1)
     return _shrink(spaced, scale * min(1, height / len(spaced)), quality)
 
 
-def frames(jpeg: bytes, count: int, height: int, quality: int, whole: bool, scale: float = 1.0) -> bytes:
+def cut_frames(jpeg: bytes, count: int, height: int, quality: int, whole: bool, scale: float = 1.0) -> bytes:
     """Return frames side by side without gaps, at most `height` pixels high, or only the last one."""
     image = decode_jpeg(jpeg)
     shown = image if whole else image[:, -image.shape[1] // count :]
@@ -61,7 +61,7 @@ def shrink_map(webp: bytes, side: int) -> bytes:
     return file.getvalue()
 
 
-def part(image: NDArray[np.uint8], rows: tuple[float, float], columns: tuple[float, float]) -> NDArray[np.uint8]:
+def cut_part(image: NDArray[np.uint8], rows: tuple[float, float], columns: tuple[float, float]) -> NDArray[np.uint8]:
     """Return the rows and columns between these fractions of an image."""
     height, width = image.shape[:2]
     return image[

@@ -21,7 +21,7 @@ from wiw.report.maps import (
     trail,
 )
 from wiw.report.plans import is_pose_row, plan_views
-from wiw.report.stage import Stage, stage_of
+from wiw.report.stage import Stage, read_stage
 from wiw.report.steps import step
 from wiw.report.story import Album, Attempt, Picture, Step, Story
 from wiw.runs.pictures import choose_pictured_episodes
@@ -40,7 +40,7 @@ def read_stories(
     return [read_story(store, index, episodes[index], outcomes[index], maps, album) for index in kept], maps
 
 
-def title(run: Run) -> str:
+def make_title(run: Run) -> str:
     """Return task and folder of a run, or one of them where they have the same name."""
     return " · ".join(dict.fromkeys((str(run.store.config["task"].get("task", "run")), run.path.name)))
 
@@ -72,17 +72,17 @@ def read_story(
     frame, picture = (None, None) if poses else _map(store, episode, rows, maps, album)
     shots = dict[str, Picture]()
     attempts = tuple(
-        _attempt(store, frame, episode, outcome, decisions[arm], shots, album, f"{index}-{number}")
+        _make_attempt(store, frame, episode, outcome, decisions[arm], shots, album, f"{index}-{number}")
         for number, (arm, outcome) in enumerate(outcomes.items())
     )
     goal = next((found for arm in outcomes if (found := store.images(arm, index, 0).get("goal"))), None)
     ends = start_and_goal(frame, episode) if frame is not None else None
     shown = (
-        album.draw(f"{index}-goal", partial(cuts.front, goal, album.goal_side, album.quality, album.scale))
+        album.draw(f"{index}-goal", partial(cuts.cut_front, goal, album.goal_side, album.quality, album.scale))
         if goal
         else None
     )
-    return Story(index, episode, shown, picture, frame, ends, attempts, wording(store), poses, shots)
+    return Story(index, episode, shown, picture, frame, ends, attempts, read_wording(store), poses, shots)
 
 
 def _map(
@@ -99,12 +99,12 @@ def _map(
     return frame_of_picture((drawing.width, drawing.height), matrix), picture
 
 
-def wording(store: RunStore) -> Wording:
+def read_wording(store: RunStore) -> Wording:
     """Return the run's words for its task's outcomes."""
     return Wording(**store.info.get("wording", {}))
 
 
-def _attempt(
+def _make_attempt(
     store: RunStore,
     frame: MapFrame | None,
     episode: Episode,
@@ -116,7 +116,7 @@ def _attempt(
 ) -> Attempt:
     """Return one arm's run of an episode; add the images of a gripper's camera to `shots`."""
     arm, index = outcome["arm"], outcome["episode"]
-    stage, steps, end = stage_of(store.info), list[Step](), ""
+    stage, steps, end = read_stage(store.info), list[Step](), ""
     beliefs = list_beliefs(decisions, list_expected(episode))
     for row, way, belief in zip(decisions, plan_views(decisions, stage), beliefs, strict=True):
         number, images = row["decision"], store.images(arm, index, row["decision"])
@@ -132,8 +132,8 @@ def _attempt(
         arm,
         outcome,
         tuple(steps),
-        _trail(frame, stage, arm, decisions),
-        wording(store),
+        _make_trail(frame, stage, arm, decisions),
+        read_wording(store),
         store.config.get("task", {}).get("categories", ()),
         album.put(f"{name}-film", "webp", film) if film else None,
         end,
@@ -141,7 +141,7 @@ def _attempt(
     )
 
 
-def _trail(
+def _make_trail(
     frame: MapFrame | None, stage: Stage | None, arm: str, decisions: Sequence[Mapping[str, Any]]
 ) -> Trail | None:
     if not decisions:

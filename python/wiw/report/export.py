@@ -61,13 +61,13 @@ def tables(run: Run) -> dict[str, Table]:
         further["judgements"] = judgements
     return {
         "arms": [dict(line) for line in arm_table(run)],
-        "episodes": _episodes(run),
+        "episodes": _tabulate_episodes(run),
         "outcomes": [
-            _without({**row, **row["metrics"], "details": to_json(row["details"])}, "metrics")
+            _drop_nested({**row, **row["metrics"], "details": to_json(row["details"])}, "metrics")
             for row in run.store.outcomes()
         ],
-        "decisions": [_decision(row) for row in decisions],
-        "candidates": [candidate for row in decisions for candidate in _candidates(row)],
+        "decisions": [_flatten_decision(row) for row in decisions],
+        "candidates": [candidate for row in decisions for candidate in _list_candidates(row)],
         **further,
     }
 
@@ -150,7 +150,7 @@ def _export(run: Run, folder: Path, suffix: str, write: Callable[[Path, Table], 
     return [folder / f"{name}.{suffix}" for name in made]
 
 
-def _columns(table: Table) -> list[str]:
+def _list_columns(table: Table) -> list[str]:
     return list(dict.fromkeys(name for row in table for name in row))
 
 
@@ -158,12 +158,12 @@ def _write_csv(path: Path, table: Table) -> None:
     from csv import DictWriter
 
     with path.open("w", newline="", encoding="utf-8") as file:
-        writer = DictWriter(file, _columns(table))
+        writer = DictWriter(file, _list_columns(table))
         writer.writeheader()
-        writer.writerows({name: _cell(value) for name, value in row.items()} for row in table)
+        writer.writerows({name: _convert_cell(value) for name, value in row.items()} for row in table)
 
 
-def _cell(value: Any) -> Any:
+def _convert_cell(value: Any) -> Any:
     return to_json(value) if isinstance(value, list | dict) else value
 
 
@@ -171,11 +171,11 @@ def _write_parquet(path: Path, table: Table) -> None:
     import pyarrow
     from pyarrow import parquet
 
-    columns = {name: [row.get(name) for row in table] for name in _columns(table)}
+    columns = {name: [row.get(name) for row in table] for name in _list_columns(table)}
     parquet.write_table(pyarrow.table(columns), path, compression="zstd")
 
 
-def _episodes(run: Run) -> Table:
+def _tabulate_episodes(run: Run) -> Table:
     rows = []
     for index, episode in enumerate(run.store.episodes()):
         row: dict[str, Any] = {"episode": index, "episode_id": episode.episode_id, "scene": episode.scene}
@@ -188,18 +188,18 @@ def _episodes(run: Run) -> Table:
     return rows
 
 
-def _decision(row: dict[str, Any]) -> dict[str, Any]:
+def _flatten_decision(row: dict[str, Any]) -> dict[str, Any]:
     numbers = {f"{column}_{name}": value for column in NUMBERED for name, value in row[column].items()}
     lists = {name: row[name] if isinstance(row[name], list) else to_json(row[name]) for name in NESTED if row[name]}
-    return {**_without(row, "proposals", "scores", *NUMBERED, *NESTED), **lists, **numbers}
+    return {**_drop_nested(row, "proposals", "scores", *NUMBERED, *NESTED), **lists, **numbers}
 
 
-def _candidates(row: dict[str, Any]) -> Iterator[dict[str, Any]]:
+def _list_candidates(row: dict[str, Any]) -> Iterator[dict[str, Any]]:
     scores = row["scores"] or [None] * len(row["proposals"])
     for number, (proposal, score) in enumerate(zip(row["proposals"], scores, strict=True)):
         name = {key: row[key] for key in ("arm", "episode", "decision")}
         yield {**name, "candidate": number, "score": score, "chosen": number == row["chosen"], **proposal}
 
 
-def _without(row: dict[str, Any], *names: str) -> dict[str, Any]:
+def _drop_nested(row: dict[str, Any], *names: str) -> dict[str, Any]:
     return {name: value for name, value in row.items() if name not in names}

@@ -22,7 +22,7 @@ from wiw.errors import ArgumentError
 from wiw.files import atomic_file
 from wiw.metrics.metric import SPL_RULE
 from wiw.report import plots
-from wiw.report.episodes import read_stories, title, wording
+from wiw.report.episodes import make_title, read_stories, read_wording
 from wiw.report.story import Album
 from wiw.report.templating import environment, format_signed
 from wiw.runs.pictures import choose_pictured_episodes
@@ -104,10 +104,10 @@ def _gather_findings(run: Run) -> dict[str, Any]:
     summary, config, info = summarise_run(run), run.store.config, run.store.info
     truths, ledger, blamed = fidelity(run), costs(run), read_blame(run.store)
     measured, paid = choose_columns(truths), cost_columns(ledger)
-    words = wording(run.store)
+    words = read_wording(run.store)
     return {
-        **_common(summary),
-        "title": title(run),
+        **_collect_common(summary),
+        "title": make_title(run),
         "task": config["task"],
         "created": run.store.created,
         "version": f"{run.store.wiw_version}, benchmark {run.store.benchmark}",
@@ -115,7 +115,7 @@ def _gather_findings(run: Run) -> dict[str, Any]:
         "sentence": "" if summary.tiers else sentence(summary, words),
         "tiers": [{**tier, "sentence": sentence(tier["summary"], words)} for tier in _list_tiers(summary)],
         "terms": explain_metrics(summary, words),
-        "plots": _plots(run, summary, truths, blamed),
+        "plots": _draw_plots(run, summary, truths, blamed),
         "costs": [(line, line.cells()[: len(paid)]) for line in ledger],
         "cost_columns": paid,
         "fidelity": [(line, line.cells(measured)) for line in truths],
@@ -140,11 +140,11 @@ def summary_html(summary: Summary) -> str:
 def list_table_values(summary: Summary, more: Sequence[Difference] = ()) -> dict[str, Any]:
     """Return what the macros for tables take; `more` are differences that are shown besides the summary's."""
     reach = _reach([*summary.differences, *more])
-    return {**_common(summary), "reach": reach, "tiers": _list_tiers(summary)}
+    return {**_collect_common(summary), "reach": reach, "tiers": _list_tiers(summary)}
 
 
 def _list_tiers(summary: Summary) -> list[dict[str, Any]]:
-    return [{**_common(own), "name": tier} for tier, own in summary.tiers.items()]
+    return [{**_collect_common(own), "name": tier} for tier, own in summary.tiers.items()]
 
 
 def sentence(summary: Summary, words: Wording | None = None) -> str:
@@ -210,20 +210,20 @@ def _find_difference(summary: Summary, arm: str, base: str, metric: str) -> Diff
     return next((d for d in summary.differences if (d.arm, d.base, d.metric) == wanted), None)
 
 
-def _common(summary: Summary) -> dict[str, Any]:
+def _collect_common(summary: Summary) -> dict[str, Any]:
     return {
         "summary": summary,
         "metrics": list_columns(summary),
         "notes": notes(summary),
         "groups": summary.groups(),
         "utilities": {found.arm: found for found in summary.utilities},
-        "utility_ends": _utility_ends(summary),
+        "utility_ends": _find_utility_ends(summary),
         "colors": plots.arm_colors([line.name for line in summary.lines]),
         "reach": _reach(summary.differences),
     }
 
 
-def _utility_ends(summary: Summary) -> tuple[float, float]:
+def _find_utility_ends(summary: Summary) -> tuple[float, float]:
     """Return the ends of the utility scale: at least [0, 1], and wide enough for all arms within [-1, 2]."""
     shown = [found for found in summary.utilities if found.is_defined]
     low = min([0.0, *(max(-1.0, found.low) for found in shown), *(found.value for found in shown)])
@@ -239,7 +239,7 @@ def _reach(differences: Sequence[Difference]) -> dict[str, float]:
     return reach
 
 
-def _plots(
+def _draw_plots(
     run: Run, summary: Summary, truths: Sequence[ArmFidelity], blamed: Blame | None
 ) -> list[tuple[str, str, Markup]]:
     """Return title, explanation and drawing of each plot."""
@@ -248,7 +248,7 @@ def _plots(
     }
     if not any(rows and "success" in rows[0]["metrics"] for rows in done.values()):
         return []
-    words = wording(run.store)
+    words = read_wording(run.store)
     found = _plot_anytime_curves(summary)
     about = "Bars are 95 % intervals; dashed lines mark the floor (copy) and the oracle."
     found.append(("Success by arm", about, plots.success_by_arm(summary)))

@@ -11,7 +11,7 @@ from typing import Any
 
 from wiw.action import FORWARD, STOP, TURN_LEFT, TURN_RIGHT
 from wiw.report import cuts
-from wiw.report.stage import Drawing, Stage, signs
+from wiw.report.stage import Drawing, Stage, format_signs
 from wiw.report.story import Album
 from wiw.tabletop.workbench import SHUT
 
@@ -26,7 +26,7 @@ class Primitives:
 
     def text(self, plan: Sequence[int]) -> str:
         """Return a plan as a few symbols."""
-        return glyphs(plan)
+        return format_glyphs(plan)
 
     def drawing(self, plan: Sequence[int]) -> Drawing | None:
         """Return a plan's drawing; None for primitives."""
@@ -63,7 +63,7 @@ class Poses:
 
     def text(self, plan: Sequence[Sequence[float]]) -> str:
         """Return a plan as a few symbols."""
-        return signs(plan, self.start, self.shut)
+        return format_signs(plan, self.start, self.shut)
 
     def drawing(self, plan: Sequence[Sequence[float]]) -> Drawing | None:
         """Return a plan's drawing on the camera image."""
@@ -71,11 +71,11 @@ class Poses:
 
     def observation(self, jpeg: bytes, album: Album) -> bytes:
         """Return the camera image as WebP bytes for the album."""
-        return cuts.front(jpeg, album.front_side, album.quality, album.scale)
+        return cuts.cut_front(jpeg, album.front_side, album.quality, album.scale)
 
     def strip(self, jpeg: bytes, frames: int, album: Album) -> bytes:
         """Return an imagined or true future as WebP bytes: every frame without a gap, or the last one."""
-        return cuts.frames(jpeg, frames, album.end_side, album.quality, album.whole, album.scale)
+        return cuts.cut_frames(jpeg, frames, album.end_side, album.quality, album.whole, album.scale)
 
 
 def plan_views(decisions: Iterable[Mapping[str, Any]], stage: Stage | None) -> list[Primitives | Poses]:
@@ -107,6 +107,6 @@ def numbers(plan: Sequence[Any]) -> str:
     return ", ".join(f"({numbers(action)})" if isinstance(action, list) else f"{action:.3g}" for action in plan)
 
 
-def glyphs(actions: Sequence[int]) -> str:
+def format_glyphs(actions: Sequence[int]) -> str:
     """Return primitives as arrows; ids without one as numbers."""
     return "".join(GLYPHS.get(action, f"({action})") for action in actions)

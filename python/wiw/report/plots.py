@@ -66,7 +66,7 @@ def success_by_arm(summary: Summary) -> Markup:
     """Plot success rates with their intervals; floor and oracle as lines through the others."""
     lines = [line for line in summary.arms if "success" in line.estimates]
     colors = arm_colors([line.name for line in summary.arms])
-    figure, axes = _figure()
+    figure, axes = _make_figure()
     for y, line in enumerate(reversed(lines)):
         found = line.estimates["success"]
         if line.name in ("copy", "oracle"):
@@ -79,13 +79,13 @@ def success_by_arm(summary: Summary) -> Markup:
     axes.xaxis.set_major_locator(MaxNLocator(TICKS))
     axes.set_xlabel("success rate, %")
     axes.grid(axis="x", color=INK, alpha=0.08)
-    return _svg(figure, "success-by-arm")
+    return _render_svg(figure, "success-by-arm")
 
 
 def success_by_rollouts(series: Mapping[str, Sequence[tuple[float, Any, str]]]) -> Markup:
     """Plot success rates with their intervals against imagined futures; each series has (rollouts, estimate, label)."""
     colors = arm_colors(list(series))
-    figure, axes = _figure()
+    figure, axes = _make_figure()
     for name, points in series.items():
         axes.plot(
             [x for x, _, _ in points], [found.value for _, found, _ in points], "-o", color=colors[name], label=name
@@ -98,14 +98,14 @@ def success_by_rollouts(series: Mapping[str, Sequence[tuple[float, Any, str]]]) 
     axes.set_xlabel("imagined futures per episode")
     axes.set_ylabel("success rate, %")
     axes.grid(axis="y", color=INK, alpha=0.08)
-    _legend(axes)
-    return _svg(figure, "success-by-rollouts")
+    _draw_legend(axes)
+    return _render_svg(figure, "success-by-rollouts")
 
 
 def success_by_rank(truths: Sequence[ArmFidelity], summary: Summary) -> Markup:
     """Plot success rates with their intervals against rank agreement, a point per arm."""
     colors = arm_colors([line.name for line in summary.arms])
-    figure, axes = _figure()
+    figure, axes = _make_figure()
     for line in truths:
         estimate = summary[line.arm].estimates["success"]
         axes.plot([line.rank] * 2, [estimate.low, estimate.high], color=colors[line.arm], lw=4, alpha=0.35)
@@ -114,16 +114,16 @@ def success_by_rank(truths: Sequence[ArmFidelity], summary: Summary) -> Markup:
     axes.set_ylim(-3, 103)
     axes.set_xlabel("rank agreement, Kendall's tau")
     axes.set_ylabel("success rate, %")
-    _legend(axes)
-    return _svg(figure, "success-by-rank")
+    _draw_legend(axes)
+    return _render_svg(figure, "success-by-rank")
 
 
 def success_by_measure(found: QualityTable, measure: str, label: str) -> Markup:
     """Plot success rates against a measure of imagined frames, a point per arm, with the intervals of both."""
-    figure, axes = _figure()
+    figure, axes = _make_figure()
     _draw_success_by_measure(axes, found, measure, label)
-    _legend(axes)
-    return _svg(figure, f"success-by-{measure}")
+    _draw_legend(axes)
+    return _render_svg(figure, f"success-by-{measure}")
 
 
 def draw_success_by_measures(found: QualityTable, measures: Mapping[str, str], form: str) -> bytes:
@@ -136,7 +136,7 @@ def draw_success_by_measures(found: QualityTable, measures: Mapping[str, str], f
     """
     figure = Figure(figsize=(4.7 * len(measures), 3.5), layout="constrained")
     for axes, (measure, label) in zip(np.atleast_1d(figure.subplots(1, len(measures))), measures.items(), strict=True):
-        _style(axes)
+        _style_axes(axes)
         _draw_success_by_measure(axes, found, measure, label)
     handles, texts = figure.axes[0].get_legend_handles_labels()
     columns = min(6, len(texts))
@@ -162,7 +162,7 @@ def _draw_success_by_measure(axes: Axes, found: QualityTable, measure: str, labe
 
 def scaling_curves(found: ScalingTable) -> Markup:
     """Plot the primary measures of a data-scaling study over numbers of clips."""
-    return _svg(_draw_scaling(found), "data-scaling")
+    return _render_svg(_draw_scaling(found), "data-scaling")
 
 
 def draw_scaling(found: ScalingTable, form: str) -> bytes:
@@ -177,7 +177,7 @@ def _draw_scaling(found: ScalingTable) -> Figure:
     grid = figure.subplots(rows, columns, squeeze=False, sharey="col")
     for model, own in zip(found.models, grid, strict=True):
         for (measure, label), axes in zip(found.primary.items(), own, strict=True):
-            _style(axes)
+            _style_axes(axes)
             _draw_scaling_measure(axes, found, model, measure)
             axes.set_title(model, loc="left", fontsize=11, color=INK)
             axes.set_xlabel("clips")
@@ -244,7 +244,7 @@ ERROR_PANELS = (("looks", "flicker"), ("control",), ("content",))
 
 def error_curves(tables: Sequence[ErrorTable]) -> Markup:
     """Plot success and regret over the distance of frames from the true ones, a line for each kind of error."""
-    return _svg(_draw_errors(tables), "errors")
+    return _render_svg(_draw_errors(tables), "errors")
 
 
 def draw_errors(tables: Sequence[ErrorTable], form: str) -> bytes:
@@ -305,7 +305,7 @@ def _draw_error_families(axes: Axes, table: ErrorTable, measure: str, regret: bo
 
 def _prepare_error_axes(axes: Axes, table: ErrorTable, regret: bool) -> float:
     """Draw the levels of the references; return that of the oracle."""
-    _style(axes)
+    _style_axes(axes)
     ceiling = 0.0 if regret else table.references["oracle"].value
     axes.axhline(ceiling, color=ROLE_COLORS["oracle"], lw=1, ls=(0, (4, 3)))
     if not regret:
@@ -323,7 +323,7 @@ def _find_error_point(line: ErrorLine, regret: bool) -> Any:
 def blame_by_arm(found: Blame) -> Markup:
     """Plot each arm's failures by the stage to blame, as stacked bars."""
     lines = list(reversed(found.arms))
-    figure, axes = _figure()
+    figure, axes = _make_figure()
     left = np.zeros(len(lines))
     for verdict in found.scheme.verdicts:
         color = BLAME_COLORS[verdict]
@@ -337,7 +337,7 @@ def blame_by_arm(found: Blame) -> Markup:
                     f"{count:.0f}",
                     ha="center",
                     va="center",
-                    color=_readable_on(color),
+                    color=_choose_text_color(color),
                     fontsize=9,
                 )
         left += counts
@@ -346,22 +346,22 @@ def blame_by_arm(found: Blame) -> Markup:
     axes.xaxis.set_major_locator(MaxNLocator(TICKS, integer=True))
     axes.set_xlabel("failures, episodes")
     axes.grid(visible=False, axis="y")
-    _legend(axes)
-    return _svg(figure, "blame-by-arm")
+    _draw_legend(axes)
+    return _render_svg(figure, "blame-by-arm")
 
 
 def success_by_distance(outcomes: Outcomes, words: Wording) -> Markup:
     """Plot success by path length: single episodes where there are few, else rates in bins of equal counts."""
     colors = arm_colors(list(outcomes))
-    figure, axes = _figure()
+    figure, axes = _make_figure()
     if shows_single_outcomes(outcomes):
-        _outcome_dots(axes, outcomes, colors)
+        _draw_outcome_dots(axes, outcomes, colors)
     else:
         _draw_binned_rates(axes, outcomes, colors)
     axes.set_xlim(left=0)
     axes.xaxis.set_major_locator(MaxNLocator(TICKS))
     axes.set_xlabel(f"shortest path {words.way}, m")
-    return _svg(figure, "success-by-distance")
+    return _render_svg(figure, "success-by-distance")
 
 
 def shows_single_outcomes(outcomes: Outcomes) -> bool:
@@ -369,7 +369,7 @@ def shows_single_outcomes(outcomes: Outcomes) -> bool:
     return max((len(rows) for rows in outcomes.values()), default=0) < FEW
 
 
-def _outcome_dots(axes: Axes, outcomes: Outcomes, colors: Mapping[str, str]) -> None:
+def _draw_outcome_dots(axes: Axes, outcomes: Outcomes, colors: Mapping[str, str]) -> None:
     for y, (arm, rows) in enumerate(reversed(list(outcomes.items()))):
         for row in rows:
             filled = colors[arm] if row["metrics"].get("success") else "none"
@@ -399,12 +399,12 @@ def _draw_binned_rates(axes: Axes, outcomes: Outcomes, colors: Mapping[str, str]
         )
     axes.set_ylim(-3, 103)
     axes.set_ylabel("success rate, %")
-    _legend(axes)
+    _draw_legend(axes)
 
 
 def anytime_curve(found: Breakdown) -> Markup:
     """Plot the score if episodes are cut after so many primitives or decisions, with bands; blind answers dashed."""
-    figure, axes = _figure()
+    figure, axes = _make_figure()
     colors, cuts = arm_colors(list(found.estimates)), [int(key) for key in found.keys]
     blind = found.estimates.get(BLIND)
     _draw_bands(axes, found, colors)
@@ -417,18 +417,18 @@ def anytime_curve(found: Breakdown) -> Markup:
                 axes.plot([0, cuts[0]], [level, first.value], color=colors[arm], lw=1.2, alpha=0.6)
     axes.set_ylim(-3, 103)
     axes.set_ylabel(f"{_name_score(found)}, %")
-    _legend(axes)
-    return _svg(figure, "anytime-curve")
+    _draw_legend(axes)
+    return _render_svg(figure, "anytime-curve")
 
 
 def anytime_differences(found: Breakdown) -> Markup:
     """Plot the gain in score over a base if episodes are cut after so many primitives or decisions, with bands."""
-    figure, axes = _figure()
+    figure, axes = _make_figure()
     _draw_bands(axes, found, arm_colors([found.base, *found.estimates]))
     axes.axhline(0, color=INK, lw=1, alpha=0.5)
     axes.set_ylabel(f"{_name_score(found)}, points")
-    _legend(axes)
-    return _svg(figure, f"anytime-differences-{found.base}")
+    _draw_legend(axes)
+    return _render_svg(figure, f"anytime-differences-{found.base}")
 
 
 def _name_score(found: Breakdown) -> str:
@@ -451,7 +451,7 @@ def _draw_bands(axes: Axes, found: Breakdown, colors: Mapping[str, str]) -> None
     axes.set_xlabel(found.cut_unit)
 
 
-def _readable_on(color: str) -> str:
+def _choose_text_color(color: str) -> str:
     """Return black or white, whichever stands out more from a colour."""
     linear = [((c + 0.055) / 1.055) ** 2.4 for c in to_rgb(color)]
     luminance = float(np.dot(linear, (0.2126, 0.7152, 0.0722)))
@@ -468,14 +468,14 @@ def _fold(arm: str) -> str:
     return "\n".join(lines)
 
 
-def _figure() -> tuple[Figure, Axes]:
+def _make_figure() -> tuple[Figure, Axes]:
     figure = Figure(figsize=(4.7, 3.1), layout="constrained")
     axes = figure.add_subplot()
-    _style(axes)
+    _style_axes(axes)
     return figure, axes
 
 
-def _style(axes: Axes) -> None:
+def _style_axes(axes: Axes) -> None:
     axes.spines[["top", "right", "left"]].set_visible(False)
     axes.spines["bottom"].set_color(INK)
     axes.spines["bottom"].set_alpha(0.3)
@@ -486,7 +486,7 @@ def _style(axes: Axes) -> None:
     axes.set_axisbelow(True)
 
 
-def _legend(axes: Axes) -> None:
+def _draw_legend(axes: Axes) -> None:
     texts = axes.get_legend_handles_labels()[1]
     longest = max(map(len, texts), default=0)
     widest = 4 if longest < 11 else 2 if longest < 20 else 1  # columns that fit the drawing's width
@@ -503,7 +503,7 @@ def _draw_on_white(figure: Figure, form: str, salt: str) -> bytes:
     return buffer.getvalue()
 
 
-def _svg(figure: Figure, name: str) -> Markup:
+def _render_svg(figure: Figure, name: str) -> Markup:
     buffer = io.StringIO()
     with rc_context({"svg.fonttype": "none", "svg.hashsalt": name, "font.family": "sans-serif"}):
         figure.savefig(buffer, format="svg", transparent=True, metadata={"Date": None, "Creator": None})

@@ -10,7 +10,7 @@ import numpy as np
 
 from wiw.report.plans import Poses, Primitives, plan_views
 from wiw.report.plots import arm_colors
-from wiw.report.stage import stage_of
+from wiw.report.stage import read_stage
 from wiw.runs.run import Run
 from wiw.types import Episode
 
@@ -21,7 +21,7 @@ def record(run: Run, file: Path) -> None:
 
     stream = rr.RecordingStream("wiw", recording_id=f"{run.path.name} {run.store.created}")
     stream.save(file)
-    stage = stage_of(run.store.info)
+    stage = read_stage(run.store.info)
     up = rr.ViewCoordinates.RIGHT_HAND_Y_UP if stage is None else rr.ViewCoordinates.RIGHT_HAND_Z_UP
     stream.log("/", up, static=True)
     colors, episodes, begun = arm_colors(run.arms), run.store.episodes(), set[int]()
@@ -29,7 +29,7 @@ def record(run: Run, file: Path) -> None:
         arm, index = outcome["arm"], outcome["episode"]
         home = f"/episode_{index:04d}"
         if index not in begun:
-            _ends(rr, stream, home, episodes[index])
+            _log_ends(rr, stream, home, episodes[index])
             begun.add(index)
         place = f"{home}/{rr.escape_entity_path_part(arm)}"
         ended = f"{outcome['status']} {outcome['metrics']} {outcome['error']}".strip()
@@ -37,14 +37,14 @@ def record(run: Run, file: Path) -> None:
         rows = run.store.decisions(arm, index)
         for row, way in zip(rows, plan_views(rows, stage), strict=True):
             stream.set_time("decision", sequence=row["decision"])
-            _decision(rr, stream, place, row, way, colors[arm])
+            _log_decision(rr, stream, place, row, way, colors[arm])
             for name, jpeg in run.store.images(arm, index, row["decision"]).items():
                 stream.log(f"{place}/{name}", rr.EncodedImage(contents=jpeg, media_type="image/jpeg"))
     stream.flush()
     stream.disconnect()
 
 
-def _ends(rr: Any, stream: Any, home: str, episode: Episode) -> None:
+def _log_ends(rr: Any, stream: Any, home: str, episode: Episode) -> None:
     stream.log(f"{home}/scene", rr.TextDocument(episode.info.get("instruction", episode.scene)), static=True)
     if episode.kind:  # such as a task at a table, whose start and goal are no places
         return
@@ -57,7 +57,7 @@ def _ends(rr: Any, stream: Any, home: str, episode: Episode) -> None:
     stream.log(f"{home}/world", points, static=True)
 
 
-def _decision(rr: Any, stream: Any, place: str, row: dict[str, Any], way: Primitives | Poses, color: str) -> None:
+def _log_decision(rr: Any, stream: Any, place: str, row: dict[str, Any], way: Primitives | Poses, color: str) -> None:
     stream.log(
         f"{place}/path",
         rr.LineStrips3D(

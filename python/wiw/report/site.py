@@ -16,9 +16,9 @@ from typing import Any
 from wiw._core import core
 from wiw.files import atomic_folder
 from wiw.report.beliefs import read_verdict
-from wiw.report.episodes import outcomes_by_episode, read_story, title, wording
+from wiw.report.episodes import make_title, outcomes_by_episode, read_story, read_wording
 from wiw.report.plots import arm_colors
-from wiw.report.story import Album, Picture, Story, final_answer, place, where
+from wiw.report.story import Album, Picture, Story, final_answer, name_place, place
 from wiw.report.templating import environment
 from wiw.runs.run import Run
 from wiw.types import Episode, Wording
@@ -136,8 +136,8 @@ def write_view(run: Run, folder: Path) -> Site:
         pages = draft / "episodes"
         pages.mkdir()
         outcomes = outcomes_by_episode(run.store, run.arms)
-        lines = _lines(run, outcomes)
-        common = _common(run)
+        lines = _list_lines(run, outcomes)
+        common = _collect_common(run)
         (draft / "index.html").write_text(_index(run, lines, common), encoding="utf-8")
         listed = [line for line in lines if line.has_page]
         for number, line in enumerate(listed):
@@ -145,7 +145,7 @@ def write_view(run: Run, folder: Path) -> Site:
             story = read_story(run.store, line.index, line.episode, outcomes[line.index], scenes, album)
             common |= {"before": listed[number - 1] if number else None}
             common |= {"after": listed[number + 1] if number + 1 < len(listed) else None}
-            (pages / line.file).write_text(_episode(story, scenes, common), encoding="utf-8")
+            (pages / line.file).write_text(_render_episode(story, scenes, common), encoding="utf-8")
             album.finish()
     return Site(folder / "index.html", len(listed), album.count, album.size)
 
@@ -164,43 +164,43 @@ def _index(run: Run, lines: list[Line], common: Mapping[str, Any]) -> str:
     return template.render(**common, lines=lines, groups=list(dict.fromkeys(line.group for line in lines)))
 
 
-def _episode(story: Story, maps: Mapping[str, Picture], values: Mapping[str, Any]) -> str:
+def _render_episode(story: Story, maps: Mapping[str, Picture], values: Mapping[str, Any]) -> str:
     template = environment().get_template("episode_page.html.j2")
     return template.render(**values, story=story, maps=maps)
 
 
-def _common(run: Run) -> dict[str, Any]:
+def _collect_common(run: Run) -> dict[str, Any]:
     task = run.store.config["task"]
     return {
-        "title": title(run),
+        "title": make_title(run),
         "arms": run.arms,
         "colors": arm_colors(run.arms),
         "radius": task.get("radius"),
         "place": place,
         "whole": PictureFolder.whole,
-        "words": wording(run.store),
+        "words": read_wording(run.store),
         "choices": task.get("categories", ()),
         "judge": run.store.judge,
         "judged": "judge" in task,
     }
 
 
-def _lines(run: Run, outcomes: Mapping[int, Mapping[str, Any]]) -> list[Line]:
+def _list_lines(run: Run, outcomes: Mapping[int, Mapping[str, Any]]) -> list[Line]:
     pictures = set(run.store.info["pictures"])
-    words, choices = wording(run.store), run.store.config["task"].get("categories", ())
+    words, choices = read_wording(run.store), run.store.config["task"].get("categories", ())
     return [
         Line(
             index,
             episode,
-            where(episode),
-            tuple(_cell(arm, outcomes.get(index, {}).get(arm), words, choices) for arm in run.arms),
+            name_place(episode),
+            tuple(_make_cell(arm, outcomes.get(index, {}).get(arm), words, choices) for arm in run.arms),
             index in pictures,
         )
         for index, episode in enumerate(run.store.episodes())
     ]
 
 
-def _cell(arm: str, outcome: Mapping[str, Any] | None, words: Wording, choices: Sequence[str]) -> Cell:
+def _make_cell(arm: str, outcome: Mapping[str, Any] | None, words: Wording, choices: Sequence[str]) -> Cell:
     if outcome is None:
         return Cell(arm, "open", "to run", "not run yet")
     if outcome["status"] == "error":
@@ -209,10 +209,10 @@ def _cell(arm: str, outcome: Mapping[str, Any] | None, words: Wording, choices: 
     if verdict is not None:
         state = "success" if outcome["metrics"].get("success") else "failure"
         return Cell(arm, state, verdict.answer or "no answer", f"{verdict.text}; its answer")
-    return _cell_of_numbers(arm, outcome["metrics"], words, choices)
+    return _make_number_cell(arm, outcome["metrics"], words, choices)
 
 
-def _cell_of_numbers(arm: str, metrics: Mapping[str, Any], words: Wording, choices: Sequence[str]) -> Cell:
+def _make_number_cell(arm: str, metrics: Mapping[str, Any], words: Wording, choices: Sequence[str]) -> Cell:
     count = f"{metrics['decisions']:.0f}" if "decisions" in metrics else ""
     if metrics.get("success"):
         return Cell(arm, "success", count, f"{words.won}; number of decisions")

@@ -69,28 +69,28 @@ class Stage:
         turns = [k for k in range(len(plan)) if k + 1 == len(plan) or (k and shut[k] != shut[k - 1])]
         shown = range(len(plan)) if len(plan) <= SINGLE else turns
         stops = tuple(Stop(tuple(seen[k + 1].tolist()), tuple(feet[k + 1].tolist()), shut[k], k + 1) for k in shown)
-        return Drawing(_polyline(seen), stops)
+        return Drawing(_format_points(seen), stops)
 
     def trail(self, arm: str, decisions: Sequence[Mapping[str, Any]]) -> Trail:
         """Return the path that the decisions of one episode took, with a stop where each starts."""
         way = self.pixels(np.concatenate([np.asarray(row["path"], np.float64) for row in decisions]))
         ends = [(row["before_x"], row["before_y"], row["before_z"]) for row in decisions]
         ends.append(tuple(decisions[-1][f"after_{axis}"] for axis in "xyz"))
-        return Trail(arm, _polyline(way), tuple(Mark(float(x), float(y), 0.0) for x, y in self.pixels(ends)))
+        return Trail(arm, _format_points(way), tuple(Mark(float(x), float(y), 0.0) for x, y in self.pixels(ends)))
 
 
-def stage_of(info: Mapping[str, Any]) -> Stage | None:
+def read_stage(info: Mapping[str, Any]) -> Stage | None:
     """Return the stage that a run's information describes, if its task has one."""
     kept = info.get("stage")
     return None if kept is None else Stage(Camera(**kept["camera"]), float(kept["ground"]))
 
 
-def _polyline(pixels: NDArray[np.float64]) -> str:
+def _format_points(pixels: NDArray[np.float64]) -> str:
     """Return points [N, 2] as SVG text."""
     return " ".join(f"{x:.1f},{y:.1f}" for x, y in pixels)
 
 
-def signs(plan: Plan, start: Sequence[float], shut: bool = False) -> str:
+def format_signs(plan: Plan, start: Sequence[float], shut: bool = False) -> str:
     """Return a plan as arrows, with marks where the gripper closes and opens: "↘ ↧● ↥ ← ↧○".
 
     Args:
@@ -101,12 +101,12 @@ def signs(plan: Plan, start: Sequence[float], shut: bool = False) -> str:
     found, here = list[str](), start
     for pose in plan:
         closes = pose[6] < SHUT
-        found.append(_way(here, pose) + ("" if closes == shut else GRIPS if closes else LETS_GO))
+        found.append(_find_sign(here, pose) + ("" if closes == shut else GRIPS if closes else LETS_GO))
         here, shut = pose[:3], closes
     return " ".join(found if len(plan) <= SINGLE else [sign for sign, _ in groupby(found)])
 
 
-def _way(here: Sequence[float], pose: Sequence[float]) -> str:
+def _find_sign(here: Sequence[float], pose: Sequence[float]) -> str:
     ahead, right, up = np.subtract(pose[:3], here[:3])
     along = np.hypot(ahead, right)
     if max(along, abs(up)) < STILL:

@@ -34,12 +34,12 @@ def step(
         row["decision"] + 1,
         way.text(row["executed"]),
         album.draw(f"{name}-seen", partial(way.observation, seen, album)) if seen else None,
-        tuple(_candidates(row, images, way, album, name)),
+        tuple(_list_candidates(row, images, way, album, name)),
         way.text(row["actions"]) if row["chosen"] is None else "",
-        _remaining_distance(row, "before"),
-        _remaining_distance(row, "after"),
+        _find_remaining_distance(row, "before"),
+        _find_remaining_distance(row, "after"),
         row["note"],
-        _fidelity(row["fidelity"]),
+        _format_fidelity(row["fidelity"]),
         row["seconds"],
         row["calls"],
         belief.text if belief is not None else "",
@@ -55,18 +55,18 @@ def _make_belief_pictures(images: Mapping[str, bytes], album: Album, name: str) 
     found = {title.removeprefix(PREFIX): image for title, image in images.items() if title.startswith(PREFIX)}
     size = album.belief_width, album.belief_quality, album.scale
     return tuple(
-        (title.replace("_", " "), album.draw(f"{name}-believed-{index}", partial(cuts.front, image, *size)))
+        (title.replace("_", " "), album.draw(f"{name}-believed-{index}", partial(cuts.cut_front, image, *size)))
         for index, (title, image) in enumerate(list(found.items())[: album.belief_count])
     )
 
 
-def _fidelity(found: Mapping[str, Any] | None) -> str:
+def _format_fidelity(found: Mapping[str, Any] | None) -> str:
     """Return e.g. "rank agreement +0.33 · regret 0.120"."""
     said = {"rank agreement": ("rank", "{:+.2f}"), "regret": ("regret", "{:.3f}")}
     return _join_numbers(found or {}, said)
 
 
-def _truth(found: Mapping[str, Any] | None, index: int) -> tuple[str, bool]:
+def _format_truth(found: Mapping[str, Any] | None, index: int) -> tuple[str, bool]:
     """Return the measurements of a candidate's true future, and whether it scores best."""
     if found is None:
         return "", False
@@ -84,18 +84,18 @@ def _join_numbers(values: Mapping[str, Any], said: Mapping[str, tuple[str, str]]
     )
 
 
-def _remaining_distance(row: Mapping[str, Any], when: str) -> float | None:
+def _find_remaining_distance(row: Mapping[str, Any], when: str) -> float | None:
     geodesic, straight = row[f"{when}_geodesic"], row[f"{when}_distance"]
     known = geodesic if geodesic is not None and np.isfinite(geodesic) else straight
     return None if known is None else float(known)
 
 
-def _candidates(
+def _list_candidates(
     row: Mapping[str, Any], images: Mapping[str, bytes], way: Primitives | Poses, album: Album, name: str
 ) -> list[Candidate]:
     proposals = row["proposals"]
     scores = row["scores"] or [None] * len(proposals)
-    shares = _shares(scores)
+    shares = _scale_scores(scores)
     found = []
     for index, proposal in enumerate(proposals):
         real = row["real_frames"][index] if row["real_frames"] else []
@@ -114,7 +114,7 @@ def _candidates(
                 proposal["note"],
                 shown.get("imagined"),
                 shown.get("true"),
-                *_truth(row["fidelity"], index),
+                *_format_truth(row["fidelity"], index),
                 sum(real[k] for k in kept) if real else 0,
                 len(kept),
                 way.drawing(proposal["actions"]),
@@ -124,7 +124,7 @@ def _candidates(
     return found
 
 
-def _shares(scores: Sequence[float | None]) -> list[float]:
+def _scale_scores(scores: Sequence[float | None]) -> list[float]:
     """Return scores scaled from 0 for the worst to 1 for the best."""
     finite = [score for score in scores if score is not None]
     low, high = (min(finite), max(finite)) if finite else (0.0, 0.0)

@@ -207,7 +207,7 @@ class Story:
     @property
     def place(self) -> str:
         """The scene's name without its folders, or the kind of task."""
-        return where(self.episode)
+        return name_place(self.episode)
 
     @property
     def instruction(self) -> str:
@@ -242,6 +242,6 @@ def place(scene: str) -> str:
     return scene if scene.startswith("apartments:") else Path(scene).name
 
 
-def where(episode: Episode) -> str:
+def name_place(episode: Episode) -> str:
     """Return the kind of an episode where its task has several, else its scene's name without its folders, and tier."""
     return episode.kind.replace("_", " ") or " · ".join(filter(None, (place(episode.scene), episode.tier)))

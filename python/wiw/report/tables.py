@@ -79,7 +79,7 @@ def print_summary(summary: SummaryTable, heading: str = "", compared: Group | No
     console.print(summary)
     if compared is not None:
         gap = " " if console.width >= ROOMY else "\n"
-        console.print(Lines(*_difference_tables(summary, compared, gap, console.width)))
+        console.print(Lines(*_make_difference_tables(summary, compared, gap, console.width)))
 
 
 def as_text(summary: SummaryTable) -> str:
@@ -152,7 +152,7 @@ def stack_tables(
         groups[-1].append(column)
     tables: list[Table] = []
     for group in groups:
-        table = _table(f"{title} (continued)" if tables else title)
+        table = _make_table(f"{title} (continued)" if tables else title)
         table.add_column(heading, style="bold", width=max(first, len(heading)), overflow="fold")
         for column in group:
             table.add_column(column.title, justify="right", style=column.style, no_wrap=True, min_width=column.width)
@@ -176,17 +176,17 @@ def _list_tables(summary: Summary, width: int) -> list[Any]:
     """Return all tables of a summary but for those of its tiers."""
     gap = " " if width >= ROOMY else "\n"
     parts: list[Any] = [Text(summary.protocol, style="dim")] if summary.protocol else []
-    parts += _arm_tables(summary, width)
+    parts += _make_arm_tables(summary, width)
     if summary.utilities:
-        parts.append(_utilities(summary))
+        parts.append(_tabulate_utilities(summary))
     for breakdown in filter(lambda found: found.stands_in_terminal, summary.breakdowns):
-        parts += _breakdown_tables(breakdown, "\n" if len(breakdown.columns) > NARROW else " ", width)
+        parts += _make_breakdown_tables(breakdown, "\n" if len(breakdown.columns) > NARROW else " ", width)
     for group in summary.groups():
-        parts += _difference_tables(summary, group, gap, width)
+        parts += _make_difference_tables(summary, group, gap, width)
     return parts
 
 
-def _table(title: str) -> Table:
+def _make_table(title: str) -> Table:
     return Table(
         title=title,
         title_justify="left",
@@ -198,26 +198,27 @@ def _table(title: str) -> Table:
     )
 
 
-def _arm_tables(summary: Summary, width: int) -> list[Table]:
+def _make_arm_tables(summary: Summary, width: int) -> list[Table]:
     which = "on the same episodes" if summary.same_episodes else "each on the episodes scored in it"
     if summary.marks is not None:
         which += f", marks by {summary.marks.judge.label}"
     lines = summary.lines
     counts = [count for count in COUNTS if count[0] == "n" or any(getattr(line, count[1]) for line in lines)]
     columns = [
-        Column(column_title(metric), [_cell(line, metric.name) for line in lines]) for metric in list_columns(summary)
+        Column(column_title(metric), [_format_cell(line, metric.name) for line in lines])
+        for metric in list_columns(summary)
     ]
     columns += [Column(name, [str(getattr(line, key)) for line in lines], style) for name, key, style in counts]
     return stack_tables(f"Arms, {which}", [line.name for line in lines], columns, width)
 
 
-def _cell(line: ArmSummary, metric: str) -> str:
+def _format_cell(line: ArmSummary, metric: str) -> str:
     estimate = line.estimates.get(metric)
     return "–" if estimate is None else show_estimate(estimate)
 
 
-def _utilities(summary: Summary) -> Table:
-    table = _table("Utility U, from copy (0) to oracle (1)")
+def _tabulate_utilities(summary: Summary) -> Table:
+    table = _make_table("Utility U, from copy (0) to oracle (1)")
     table.add_column("arm", style="bold", overflow="fold")
     for title in ("U ↑", "n"):
         table.add_column(title, justify="right", no_wrap=True)
@@ -229,7 +230,7 @@ def _utilities(summary: Summary) -> Table:
     return table
 
 
-def _breakdown_tables(breakdown: Breakdown, gap: str, width: int) -> list[Table]:
+def _make_breakdown_tables(breakdown: Breakdown, gap: str, width: int) -> list[Table]:
     """Return a table by kind, budget or outcome; `gap` stands between an estimate and its interval."""
     rows = breakdown.rows
 
@@ -244,7 +245,7 @@ def _breakdown_tables(breakdown: Breakdown, gap: str, width: int) -> list[Table]
     return stack_tables(breakdown.title, list(rows), columns, width, breakdown.corner)
 
 
-def _difference_tables(summary: Summary, group: Group, gap: str, width: int) -> list[Table]:
+def _make_difference_tables(summary: Summary, group: Group, gap: str, width: int) -> list[Table]:
     """Return one group's paired differences; `gap` stands between an estimate and its interval."""
     rows = list(group.rows.values())
     metrics = [metric for metric in list_columns(summary) if all(metric.name in row for row in rows)]

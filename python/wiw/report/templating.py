@@ -27,8 +27,14 @@ def environment() -> Environment:
         trim_blocks=True,
         lstrip_blocks=True,
     )
-    made.filters |= {"column": column_title, "p": show_p, "signed": format_signed, "how": _how, "number": _number}
-    made.filters |= {"asset": _read_asset, "minute": _minute, "counted": _count_noun}
+    made.filters |= {
+        "column": column_title,
+        "p": show_p,
+        "signed": format_signed,
+        "how": _name_method,
+        "number": _number,
+    }
+    made.filters |= {"asset": _read_asset, "minute": _format_minute, "counted": _count_noun}
     made.tests |= {"known": _is_known}
     return made
 
@@ -43,7 +49,7 @@ def _number(value: float) -> str:
     return f"{value:.2f}".replace("-", "\u2212")
 
 
-def _minute(time: str) -> str:
+def _format_minute(time: str) -> str:
     """Return e.g. "2026-11-22 18:06 UTC" of a time in ISO format."""
     return datetime.fromisoformat(time).astimezone(timezone.utc).strftime("%Y-%m-%d %H:%M UTC")
 
@@ -54,7 +60,7 @@ def _count_noun(nouns: str, count: float) -> str:
     return f"{count:g} {noun.removesuffix('s') if count == 1 else noun}"
 
 
-def _how(estimate: Estimate) -> str:
+def _name_method(estimate: Estimate) -> str:
     """Return the method of an interval, with the bootstrap as a second opinion."""
     if estimate.bootstrap is None:
         return estimate.method

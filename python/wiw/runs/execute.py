@@ -8,7 +8,6 @@ from collections.abc import Iterable, Iterator, Mapping, Sequence
 from typing import Any, Protocol
 
 from wiw.errors import Error, InfrastructureError, StoreError
-from wiw.isolation.source import end_idle_processes
 from wiw.runs.config import EngineConfig
 from wiw.runs.films import film_episodes
 from wiw.runs.pictures import drop_spare_pictures
@@ -183,27 +182,34 @@ def _run_jobs(
     workers: int,
     place: EngineConfig,
 ) -> None:
-    sizes = {
-        arm: len(left) if workers == 1 else max(spec.live, math.ceil(len(left) / (3 * workers)))
-        for arm, left in pending.items()
-    }
-    by_scene = place.engine == "ray"
-    jobs = [
-        Job(arm, tuple((index, episodes[index]) for index in group[first : first + sizes[arm]]))
-        for arm, left in pending.items()
-        for group in (_group_by_scene(left, episodes, spec.live) if by_scene else [left])
-        for first in range(0, len(group), max(1, sizes[arm]))
-    ]
-    if jobs and (place.engine == "ray" or workers > 1):
-        end_idle_processes()
-    if place.engine == "ray" and jobs:
+    """Run the pending episodes of each arm by the engine that `place` names."""
+    if not any(pending.values()):
+        return
+    if place.engine == "ray":
         from wiw.runs.ray_engine import run_on_ray
 
-        run_on_ray(spec, jobs, writer, workers, place)
-    elif workers == 1 or len(jobs) == 0:
+        groups = {arm: _group_by_scene(left, episodes, spec.live) for arm, left in pending.items()}
+        run_on_ray(spec, _make_jobs(spec, episodes, groups, workers), writer, workers, place)
+        return
+    jobs = _make_jobs(spec, episodes, {arm: [left] for arm, left in pending.items()}, workers)
+    if workers == 1:
         run_here(spec, jobs, writer)
     else:
         run_in_workers(spec, jobs, writer, workers)
+
+
+def _make_jobs(
+    spec: WorkerSpec, episodes: Sequence[Episode], groups: Mapping[str, Sequence[Sequence[int]]], workers: int
+) -> list[Job]:
+    """Make jobs of the episodes of each arm, none of which has episodes of two groups."""
+    jobs = []
+    for arm, own in groups.items():
+        count = sum(map(len, own))
+        size = max(1, count) if workers == 1 else max(spec.live, math.ceil(count / (3 * workers)))
+        for group in own:
+            parts = (group[first : first + size] for first in range(0, len(group), size))
+            jobs += [Job(arm, tuple((index, episodes[index]) for index in part)) for part in parts]
+    return jobs
 
 
 def _group_by_scene(indices: Iterable[int], episodes: Sequence[Episode], least: int) -> list[list[int]]:

@@ -19,7 +19,7 @@ def describe_platform() -> dict[str, Any]:
         "processor": processor_name(),
         "cores": len(os.sched_getaffinity(0)),
         "isa": core.active_isa(),
-        "packages": {name: _version(name) for name in ("numpy", "scipy", "opencv-python-headless", "torch")},
+        "packages": {name: _find_version(name) for name in ("numpy", "scipy", "opencv-python-headless", "torch")},
     }
 
 
@@ -33,7 +33,7 @@ def processor_name() -> str:
     return names[0] if names else platform.machine()
 
 
-def _version(package: str) -> str | None:
+def _find_version(package: str) -> str | None:
     try:
         return importlib.metadata.version(package)
     except importlib.metadata.PackageNotFoundError:

@@ -21,6 +21,7 @@ from dataclasses import dataclass, field, replace
 from typing import Any
 
 from wiw.errors import InfrastructureError, RemoteError, VlmError
+from wiw.isolation.source import end_idle_processes
 from wiw.ray_cluster import connect_cluster, import_ray
 from wiw.runs.config import EngineConfig
 from wiw.runs.ray_servers import START_SECONDS as SERVER_SECONDS
@@ -110,6 +111,7 @@ def run_on_ray(
         Error: what an actor raised on purpose, such as a broken contract.
     """
     import_ray()
+    end_idle_processes()
     pickle_spec(spec)  # what cannot be sent is said before a cluster is started
     with connect_cluster(config.address) as ray:
         pool = _ActorPool(ray, spec, deque(jobs), receiver, workers, config)

@@ -75,20 +75,20 @@ def to_json(value: Any) -> str:
         ArgumentError: a value has no JSON form.
     """
     try:
-        return json.dumps(_plain(value), allow_nan=False, separators=(",", ":"), ensure_ascii=False)
+        return json.dumps(_make_plain(value), allow_nan=False, separators=(",", ":"), ensure_ascii=False)
     except TypeError as error:
         raise ArgumentError(f"a record must consist of numbers, text, lists and mappings: {error}") from None
 
 
-def _plain(value: Any) -> Any:
+def _make_plain(value: Any) -> Any:
     if isinstance(value, np.ndarray | np.generic):
         value = value.tolist()
     if isinstance(value, float):
         return value if math.isfinite(value) else None
     if isinstance(value, dict):
-        return {str(key): _plain(item) for key, item in value.items()}
+        return {str(key): _make_plain(item) for key, item in value.items()}
     if isinstance(value, list | tuple):
-        return [_plain(item) for item in value]
+        return [_make_plain(item) for item in value]
     return value
 
 
@@ -109,7 +109,9 @@ def decision_row(arm: str, record: DecisionRecord, with_images: bool) -> Decisio
         "proposals": to_json(proposals),
         "real_frames": None if real is None else to_json(real),
         "answer": None if decision.answer is None else to_json(_answer(decision.answer)),
-        "fidelity": None if decision.fidelity is None else to_json(_fidelity(decision.fidelity, decision.chosen)),
+        "fidelity": None
+        if decision.fidelity is None
+        else to_json(_describe_fidelity(decision.fidelity, decision.chosen)),
         "exchanges": to_json([asdict(exchange) for exchange in decision.exchanges]),
         "note": decision.note,
         "path": to_json(record.path),
@@ -117,10 +119,10 @@ def decision_row(arm: str, record: DecisionRecord, with_images: bool) -> Decisio
         "seconds": to_json(dict(decision.seconds)),
         "calls": to_json(dict(decision.calls)),
         "spent": to_json(dict(decision.spent)),
-        **_truth("before", record.before),
-        **_truth("after", record.after),
+        **_describe_truth("before", record.before),
+        **_describe_truth("after", record.after),
     }
-    images = dict(_images(record)) if with_images else {}
+    images = dict(_encode_images(record)) if with_images else {}
     return DecisionRow(arm, int(record.episode), int(record.index), values, images)
 
 
@@ -135,7 +137,7 @@ def _answer(answer: Answer | TextAnswer) -> dict[str, Any]:
     }
 
 
-def _fidelity(found: Fidelity, chosen: int | None) -> dict[str, Any]:
+def _describe_fidelity(found: Fidelity, chosen: int | None) -> dict[str, Any]:
     return {
         "scores": found.scores,
         "rank": found.rank,
@@ -148,7 +150,7 @@ def _fidelity(found: Fidelity, chosen: int | None) -> dict[str, Any]:
     }
 
 
-def _truth(when: str, truth: Truth) -> dict[str, float]:
+def _describe_truth(when: str, truth: Truth) -> dict[str, float]:
     x, y, z = (float(value) for value in truth.position)
     return {
         f"{when}_x": x,
@@ -160,7 +162,7 @@ def _truth(when: str, truth: Truth) -> dict[str, float]:
     }
 
 
-def _images(record: DecisionRecord) -> Iterator[tuple[str, bytes]]:
+def _encode_images(record: DecisionRecord) -> Iterator[tuple[str, bytes]]:
     decision = record.decision
     if decision.observation is not None:
         name = "front" if isinstance(decision.observation, ArmObservation) else "panorama"

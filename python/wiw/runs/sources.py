@@ -41,11 +41,11 @@ def source_digests(part: Any) -> dict[str, str]:
     thing = part if inspect.isclass(part) or inspect.isroutine(part) else type(part)
     found: dict[str, str] = {}
     for each in thing.__mro__ if inspect.isclass(thing) else (thing,):
-        file = _source_file(each)
+        file = _find_source_file(each)
         if file is None:
             continue
         if each.__module__ == "__main__":
-            found |= _script_digest(file, each)
+            found |= _digest_script(file, each)
         else:
             found |= {str(path): _digest(path.read_bytes()) for path in _with_imports(file)}
     return found
@@ -86,7 +86,7 @@ SCRIPT = "::"
 """Between the path of a script and the name of its class."""
 
 
-def _script_digest(file: Path, thing: Any) -> dict[str, str]:
+def _digest_script(file: Path, thing: Any) -> dict[str, str]:
     try:
         return {f"{file}{SCRIPT}{thing.__qualname__}": _digest(inspect.getsource(thing).encode())}
     except (OSError, TypeError):
@@ -97,7 +97,7 @@ def _digest(content: bytes) -> str:
     return blake2b(content, digest_size=16).hexdigest()
 
 
-def _source_file(thing: Any) -> Path | None:
+def _find_source_file(thing: Any) -> Path | None:
     """Return the file of the user's that defines a class or function."""
     try:
         name = inspect.getsourcefile(thing)
@@ -118,11 +118,11 @@ def _with_imports(file: Path) -> set[Path]:
         path = waiting.pop()
         if path not in found:
             found.add(path)
-            waiting += _imports(path)
+            waiting += _list_imports(path)
     return found
 
 
-def _imports(file: Path) -> Iterator[Path]:
+def _list_imports(file: Path) -> Iterator[Path]:
     """Return the files of the user's that a file imports."""
     try:
         tree = ast.parse(file.read_bytes())
@@ -131,14 +131,14 @@ def _imports(file: Path) -> Iterator[Path]:
     for node in ast.walk(tree):
         if isinstance(node, ast.Import):
             for alias in node.names:
-                yield from _modules(_roots(file), alias.name)
+                yield from _list_modules(_list_roots(file), alias.name)
         elif isinstance(node, ast.ImportFrom):
-            roots = [file.parents[node.level - 1]] if node.level else _roots(file)
+            roots = [file.parents[node.level - 1]] if node.level else _list_roots(file)
             for alias in node.names:
-                yield from _modules(roots, ".".join(filter(None, (node.module, alias.name))))
+                yield from _list_modules(roots, ".".join(filter(None, (node.module, alias.name))))
 
 
-def _roots(file: Path) -> list[Path]:
+def _list_roots(file: Path) -> list[Path]:
     """Return the folders from which a file imports: its own, as of a script, and that of its outermost package."""
     package = file.parent
     while (package / "__init__.py").is_file():
@@ -146,7 +146,7 @@ def _roots(file: Path) -> list[Path]:
     return list(dict.fromkeys([file.parent, package]))
 
 
-def _modules(roots: list[Path], name: str) -> Iterator[Path]:
+def _list_modules(roots: list[Path], name: str) -> Iterator[Path]:
     """Return the files that an import of a dotted name runs: packages and module; the last part may be no module."""
     parts = name.split(".")
     for root in roots:

@@ -149,9 +149,19 @@ class RunStore:
 
     @classmethod
     def resume(
-        cls, run: str | Path, config: dict[str, Any] | None = None, scratch: str | Path | None = None
+        cls,
+        run: str | Path,
+        config: dict[str, Any] | None = None,
+        scratch: str | Path | None = None,
+        more_arms: bool = False,
     ) -> RunStore:
-        """Open an existing store for writing and discard partial episodes; `scratch` as in `create`.
+        """Open an existing store for writing and discard partial episodes.
+
+        Args:
+            run: its folder.
+            config: that the run must be of.
+            scratch: as in `create`.
+            more_arms: whether `config` may have arms that the run lacks; `add_arms` adds them.
 
         Raises:
             StoreError: missing, damaged, of another version, of another configuration than `config`, in use, or on a
@@ -165,7 +175,8 @@ class RunStore:
         with store._close_on_error():
             store.require_version()
             if config is not None:
-                _require_same(path, store.config, json.loads(to_json(config)))
+                wanted = json.loads(to_json(config))
+                _require_same(path, store.config, _drop_new_arms(store.config, wanted) if more_arms else wanted)
             store._discard_partial()
         return store
 
@@ -565,6 +576,22 @@ class RunStore:
         with self._writing() as connection:
             connection.execute("UPDATE run SET info = ?", (to_json(info),))
 
+    def add_arms(self, config: dict[str, Any], info: Mapping[str, Any]) -> None:
+        """Store arms that the run lacks, so that they can be run; `info["arms_added"]` lists them, and when.
+
+        Args:
+            config: of the run, with these arms.
+            info: what it says of all arms: "agents", "sources" and "departures".
+        """
+        known = {arm["name"] for arm in self.config["arms"]}
+        added = {"time": _now(), "arms": [arm["name"] for arm in config["arms"] if arm["name"] not in known]}
+        log = [*self.info.get("arms_added", []), added]
+        with self._writing() as connection:
+            connection.execute(
+                "UPDATE run SET config = ?, info = ?",
+                (to_json(config), to_json({**self.info, **info, "arms_added": log})),
+            )
+
     def change_settings(self, changes: Mapping[str, Any]) -> None:
         """Store settings that the run goes on with; `info["resumed_with"]` lists what was changed, and when."""
         info = self.info
@@ -910,6 +937,12 @@ def _forget(connection: sqlite3.Connection, condition: str, values: tuple[Any, .
         )
     for table in ("decision", "image", "film"):
         connection.execute(f"DELETE FROM {table} AS d WHERE {condition}", values)
+
+
+def _drop_new_arms(stored: dict[str, Any], wanted: dict[str, Any]) -> dict[str, Any]:
+    """Return the wanted configuration with none but the stored one's arms, in its order."""
+    arms = {arm["name"]: arm for arm in wanted["arms"]}
+    return {**wanted, "arms": [arms[arm["name"]] for arm in stored["arms"] if arm["name"] in arms]}
 
 
 def _require_same(path: Path, stored: dict[str, Any], wanted: dict[str, Any]) -> None:

@@ -140,14 +140,16 @@ class _Collected:
                 name: json.loads(value) if name in DECISION_JSON and value is not None else value
                 for name, value in row.values.items()
             }
-            self._of(row.episode).append(_decision(row.decision, values, row.images))
+            self._get_facts(row.episode).append(_describe_decision(row.decision, values, row.images))
         elif isinstance(row, OutcomeRow):
-            self._of(row.result.episode).append(_outcome(row.result.status, row.result.metrics, row.result.error))
+            self._get_facts(row.result.episode).append(
+                _describe_outcome(row.result.status, row.result.metrics, row.result.error)
+            )
 
     def facts(self, index: int) -> Facts:
-        return [*self._agent, *self._of(index)]
+        return [*self._agent, *self._get_facts(index)]
 
-    def _of(self, index: int) -> Facts:
+    def _get_facts(self, index: int) -> Facts:
         return self._episodes.setdefault(index, [])
 
 
@@ -155,14 +157,16 @@ def read_facts(store: RunStore, outcome: Mapping[str, Any]) -> Facts:
     """Return what was decided and measured in an ended episode, given its row of `recorded_outcomes`."""
     arm, index = outcome["arm"], outcome["episode"]
     decisions = [
-        _decision(row["decision"], row, store.images(arm, index, row["decision"]))
+        _describe_decision(row["decision"], row, store.images(arm, index, row["decision"]))
         for row in store.decisions(arm, index)
     ]
     agent = [("agent", store.info["built"][arm])] if arm in store.info.get("built", {}) else []
-    return [*agent, *decisions, _outcome(outcome["status"], outcome["metrics"], outcome["error"])]
+    return [*agent, *decisions, _describe_outcome(outcome["status"], outcome["metrics"], outcome["error"])]
 
 
-def _decision(number: int, values: Mapping[str, Any], images: Mapping[str, bytes]) -> tuple[str, dict[str, Any]]:
+def _describe_decision(
+    number: int, values: Mapping[str, Any], images: Mapping[str, bytes]
+) -> tuple[str, dict[str, Any]]:
     facts = {name: value for name, value in values.items() if name not in UNLIKE}
     if facts["fidelity"] is not None:
         facts["fidelity"] = {name: value for name, value in facts["fidelity"].items() if name != "lpips"}
@@ -171,7 +175,7 @@ def _decision(number: int, values: Mapping[str, Any], images: Mapping[str, bytes
     return f"decision {number}", json.loads(to_json({**facts, **seen}))
 
 
-def _outcome(status: str, metrics: Mapping[str, float], error: str) -> tuple[str, dict[str, Any]]:
+def _describe_outcome(status: str, metrics: Mapping[str, float], error: str) -> tuple[str, dict[str, Any]]:
     last = (error.strip().splitlines() or [""])[-1]
     return "outcome", json.loads(to_json({"status": status, **metrics, "error": last}))
 
@@ -189,12 +193,12 @@ def list_differences(recorded: Sequence[tuple[str, Any]], again: Sequence[tuple[
             return
         for name in dict.fromkeys([*was, *now]):
             if was.get(name) != now.get(name):
-                yield f"{place}: {name}: recorded {_short(was.get(name))}, now {_short(now.get(name))}"
+                yield f"{place}: {name}: recorded {_shorten(was.get(name))}, now {_shorten(now.get(name))}"
     if len(recorded) != len(again):
         yield f"the end: recorded {len(recorded)} facts, now {len(again)}"
 
 
-def _short(value: Any, most: int = 200) -> str:
+def _shorten(value: Any, most: int = 200) -> str:
     if isinstance(value, float) and math.isfinite(value):
         return repr(value)
     text = to_json(value)

@@ -22,6 +22,7 @@ from typing import Any, Protocol
 
 from wiw._core import core
 from wiw.errors import Error, InfrastructureError
+from wiw.isolation.source import end_idle_processes
 from wiw.loop.limits import Limits
 from wiw.runs.compose import RunContext
 from wiw.runs.rows import AgentRow, DecisionRow, LostRow, OutcomeRow, RestartRow, decision_row
@@ -159,6 +160,7 @@ def run_in_workers(spec: WorkerSpec, jobs: Iterable[Job], receiver: ReportReceiv
         InfrastructureError: the task or an agent cannot be sent, or workers cannot start.
         Error: what a worker raised on purpose, such as a broken contract.
     """
+    end_idle_processes()
     pool = _WorkerPool(pickle_spec(spec), deque(jobs), receiver, workers)
     try:
         pool.run()

@@ -16,9 +16,9 @@ import sys
 from pathlib import Path
 from typing import Any
 
-import wiw
 from wiw import errors
 from wiw.errors import ArgumentError, DependencyError, FileError
+from wiw.process_limits import make_child_environment
 from wiw.scenes.store import Sources
 
 TIMEOUT = 600.0
@@ -57,7 +57,7 @@ def read_in_child(module: str, job: dict[str, Any]) -> dict[str, Any]:
             capture_output=True,
             timeout=TIMEOUT,
             check=False,
-            env=_environment(),
+            env=make_child_environment(),
         )
     except subprocess.TimeoutExpired:
         raise _out_of_time(path) from None
@@ -88,10 +88,3 @@ def _reply(path: str, child: subprocess.CompletedProcess[bytes]) -> dict[str, An
 
 def _out_of_time(path: str) -> FileError:
     return FileError(f"{path}: importing took more than {TIMEOUT:.0f} s and was given up (damaged file?)")
-
-
-def _environment() -> dict[str, str]:
-    """Return our own environment, with this very package first on the child's path."""
-    here = str(Path(wiw.__file__).parents[1])
-    paths = [here, *filter(None, os.environ.get("PYTHONPATH", "").split(os.pathsep))]
-    return {**os.environ, "PYTHONPATH": os.pathsep.join(paths)}

@@ -117,7 +117,7 @@ class Queue:
         """Return the next batch, as soon as it is due; None when the queue has ended and is empty."""
         with self._changed:
             while True:
-                batch, wait = self.due()
+                batch, wait = self.find_due()
                 if batch and wait <= 0:
                     taken = set(map(id, batch))
                     self._jobs = [job for job in self._jobs if id(job) not in taken]
@@ -132,7 +132,7 @@ class Queue:
             self._ending = True
             self._changed.notify()
 
-    def due(self) -> tuple[list[Job], float]:
+    def find_due(self) -> tuple[list[Job], float]:
         """Return the batch so far, and the seconds until it is taken even if it is not full."""
         now = self._clock()
         waiting = [job for job in self._jobs if job.expires > now]

@@ -76,8 +76,8 @@ def blame(
             raise ArgumentError(f"blame: expected {name} of at least 1, got {value}")
     with RunStore.read(run) as base:
         wanted = _choose_failures(base, arms, episodes)
-        task, agents = _recipes(base, wanted)
-        store = _store(base, agents)
+        task, agents = _make_recipes(base, wanted)
+        store = _open_store(base, agents)
         named = {name_rerun(arm, rerun): indices for arm, indices in wanted.items() for rerun in list_reruns(base, arm)}
         pending = {name: sorted({*store.pending(name, retry_errors)} & indices) for name, indices in named.items()}
         if (reviser_options or tracker or tracker_options) and not any(pending.values()):
@@ -146,7 +146,7 @@ def _draw(seed: int, episode: int) -> int:
     return int(core.fold_key([seed, episode, _ORDER]))
 
 
-def _recipes(base: RunStore, wanted: Mapping[str, set[int]]) -> tuple[Any, dict[str, AgentRecipe]]:
+def _make_recipes(base: RunStore, wanted: Mapping[str, set[int]]) -> tuple[Any, dict[str, AgentRecipe]]:
     """Return the run's task, and for each of its arms the agent of each rerun.
 
     Raises:
@@ -196,13 +196,13 @@ def _replace_options(
     )
 
 
-def _store(base: RunStore, agents: Mapping[str, AgentRecipe]) -> RunStore:
+def _open_store(base: RunStore, agents: Mapping[str, AgentRecipe]) -> RunStore:
     """Create or resume the store of reruns."""
     config = {
         "task": base.config["task"],
         "seed": base.config["seed"],
         "episodes": base.config["episodes"],
-        "arms": [{"name": name, "agent": _explicit_options(recipe)} for name, recipe in agents.items()],
+        "arms": [{"name": name, "agent": _list_explicit_options(recipe)} for name, recipe in agents.items()],
         "attributes": base.created,
     }
     folder = base.path.parent / FOLDER
@@ -221,7 +221,7 @@ def _store(base: RunStore, agents: Mapping[str, AgentRecipe]) -> RunStore:
     return RunStore.create(folder, config, info, base.episodes())
 
 
-def _explicit_options(recipe: AgentRecipe) -> dict[str, Any]:
+def _list_explicit_options(recipe: AgentRecipe) -> dict[str, Any]:
     return {name: value for name, value in (recipe.to_json() or {}).items() if value not in (None, {})}
 
 

@@ -94,11 +94,11 @@ def compare(
             differs.
     """
     first, second = (_open(run, judge) for run in (a, b))
-    pairs = _pairs(first, second, arm, other)
+    pairs = _list_pairs(first, second, arm, other)
     require_comparable(first, second, pairs, unlike_budgets)
     differing = list_unlike_budgets(first, second, pairs)
     unlike = [f"UNLIKE BUDGETS: {'; '.join(differing)}."] if differing else []
-    names = _names(first, second)
+    names = _name_runs(first, second)
     sides = [
         (log, {pair[side]: f"{pair[side]} · {names[side]}" for pair in pairs})
         for side, log in enumerate((first, second))
@@ -127,12 +127,12 @@ def compare(
         for ours, theirs in labelled
         for metric in select_metrics(done)
     ]
-    lines = {line.name: line for log, labels in sides for line in _lines(log, both, labels)}
+    lines = {line.name: line for log, labels in sides for line in _summarise_arms(log, both, labels)}
     return Comparison(
         tuple(lines[line.name] for line in both.arms),
         adjust_p_values([one for one in found if one is not None]),
         both.same_episodes,
-        tuple(one for log, labels in sides for one in _utilities(log, labels)),
+        tuple(one for log, labels in sides for one in _list_utilities(log, labels)),
         both.breakdowns,
         both.baselines,
         both.marks,
@@ -150,13 +150,13 @@ def _open(run: str | Path | RunLog, judge: str | None) -> RunLog:
     return load_run(run, judge)
 
 
-def _lines(log: RunLog, both: Summary, labels: Mapping[str, str]) -> list[ArmSummary]:
+def _summarise_arms(log: RunLog, both: Summary, labels: Mapping[str, str]) -> list[ArmSummary]:
     """Return the lines of one run's arms, with the roles that they have in it; `labels` by arm."""
     policies = [one["name"] for one in log.store.config["arms"] if one["agent"].get("model") is None]
     return [replace(both[label], role=role_of(arm, policies)) for arm, label in labels.items()]
 
 
-def _utilities(log: RunLog, labels: Mapping[str, str]) -> list[Utility]:
+def _list_utilities(log: RunLog, labels: Mapping[str, str]) -> list[Utility]:
     """Return the utilities of one run's arms, with its own floor and ceiling."""
     found = log.numbers().utilities
     return [replace(one, arm=labels[one.arm]) for one in found if one.arm in labels]
@@ -182,7 +182,7 @@ def require_comparable(
         _refuse(a, b, "version of the benchmark", versions, advice)
     ours, theirs = a.store.config, b.store.config
     for name in dict.fromkeys([*ours["task"], *theirs["task"]]):
-        values = [_value(config["task"].get(name)) for config in (ours, theirs)]
+        values = [_simplify_value(config["task"].get(name)) for config in (ours, theirs)]
         if values[0] != values[1] and name not in ("judge", *BUDGET_RULES):
             _refuse(a, b, f"task.{name}", values, "run one of them again with the other's task, scenes and preset")
     if not unlike_budgets and (differing := list_unlike_budgets(a, b, pairs)):
@@ -243,7 +243,7 @@ def _require_same_episode(a: RunLog, b: RunLog, index: int, pair: tuple[Episode,
     described = [asdict(episode) for episode in pair]
     lengths = [float(one.pop("geodesic")) for one in described]
     for name in described[0]:
-        values = [_value(one[name]) for one in described]
+        values = [_simplify_value(one[name]) for one in described]
         if values[0] != values[1]:
             _refuse(a, b, f"episode {index}: {name}", values, "they ran on different episodes; run one of them again")
     if all(map(math.isfinite, lengths)) and abs(lengths[0] - lengths[1]) > LENGTH_TOLERANCE:
@@ -251,7 +251,7 @@ def _require_same_episode(a: RunLog, b: RunLog, index: int, pair: tuple[Episode,
         _refuse(a, b, f"episode {index}: shortest path", lengths, advice)
 
 
-def _value(value: Any) -> Any:
+def _simplify_value(value: Any) -> Any:
     """Return a value as it is compared: a path by its last part, as scenes lie elsewhere on another machine."""
     if isinstance(value, str) and "/" in value and Path(value).is_absolute():
         return Path(value).name
@@ -265,7 +265,7 @@ def _refuse(a: RunLog, b: RunLog, field: str, values: Sequence[Any], advice: str
     )
 
 
-def _pairs(a: RunLog, b: RunLog, arm: str | None, other: str | None) -> list[tuple[str, str]]:
+def _list_pairs(a: RunLog, b: RunLog, arm: str | None, other: str | None) -> list[tuple[str, str]]:
     if other is not None and arm is None:
         raise ArgumentError(f"compare: other='{other}' names an arm of the second run; arm= must name one of the first")
     if arm is not None:
@@ -285,7 +285,7 @@ def _pairs(a: RunLog, b: RunLog, arm: str | None, other: str | None) -> list[tup
     )
 
 
-def _names(a: RunLog, b: RunLog) -> tuple[str, str]:
+def _name_runs(a: RunLog, b: RunLog) -> tuple[str, str]:
     """Return the shortest ends of the two paths that differ."""
     paths = [log.path.resolve().parts for log in (a, b)]
     if paths[0] == paths[1]:
@@ -303,7 +303,7 @@ def _label(theirs: str, ours: str) -> str:
 
 def _describe_changes(a: RunLog, b: RunLog, pair: tuple[str, str]) -> list[str]:
     """Return how the two agents differ, by their descriptions and their version of wiw."""
-    described = [_agent(log, arm) for log, arm in zip((a, b), pair, strict=True)]
+    described = [_describe_agent(log, arm) for log, arm in zip((a, b), pair, strict=True)]
     names = dict.fromkeys([*described[0], *described[1]])
     differing = [name for name in names if described[0].get(name) != described[1].get(name)]
     label = _label(pair[1], pair[0])
@@ -314,7 +314,7 @@ def _describe_changes(a: RunLog, b: RunLog, pair: tuple[str, str]) -> list[str]:
     return [f"{label}: {', '.join(details[:MOST_NAMED])}{more}."]
 
 
-def _agent(log: RunLog, arm: str) -> dict[str, Any]:
+def _describe_agent(log: RunLog, arm: str) -> dict[str, Any]:
     """Return the agent's description as it was built, flattened; before that, as it was configured."""
     configured = next(one["agent"] for one in log.store.config["arms"] if one["name"] == arm)
     return {**_flatten(log.store.info.get("built", {}).get(arm, configured)), "wiw": log.store.wiw_version}

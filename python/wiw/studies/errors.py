@@ -153,7 +153,8 @@ def study_errors(
         found.summary()
         found.save()
 
-    The same call goes on where an earlier one was stopped, episode by episode. Runs are ordinary ones, a part of the
+    The same call goes on where an earlier one was stopped, episode by episode; with more kinds, doses or tasks it adds
+    them. Runs are ordinary ones, a part of the
     episodes each: `wiw merge runs/errors/imagenav` makes one of them, `wiw report` and `wiw view` show it.
 
     Args:
@@ -230,6 +231,7 @@ def _run_task(
             agent,
             settings.episodes,
             arms=arms,
+            more_arms=True,
             out=folder / shard.folder,
             resume=True,
             shard=str(shard),

@@ -34,6 +34,7 @@ def evaluate(
     episodes: int | None = None,
     *,
     arms: Sequence[Any] | Mapping[str, Any] | None = None,
+    more_arms: bool = False,
     config: RunConfig | None = None,
     **settings: Any,
 ) -> RunLog:
@@ -54,6 +55,7 @@ def evaluate(
             "placebo-shuffled:oracle" of another.
             "small=warpnet?weights=small.npz" names an arm and gives its model options, as on the command line; a
             mapping gives the arms names of their own. None means the agent's own model.
+        more_arms: with `resume`, whether to add the arms that the run lacks; all that it has must be unchanged.
         config: how the run goes.
         settings: any of `RunConfig`'s in place of the config's, such as seed, out, workers, keep_images, resume,
             deadline, cache and fidelity; and options of a task given by name, such as `scenes` and `preset`.
@@ -61,7 +63,7 @@ def evaluate(
     Raises:
         ArgumentError: options for a task that is already made; a number out of range.
         StoreError: `out` holds a run and `resume` is off, or a run of another configuration, or of source files that
-            have changed since.
+            have changed since; or arms are to be added to a run that a rule stops early.
         ContractError: a policy or a world model broke its contract.
         InfrastructureError: worker processes cannot be started or given their work.
         WeightsError: those of LPIPS are not there; says which, and how to get them.
@@ -69,7 +71,7 @@ def evaluate(
     own, task_options = take_settings(config, settings, episodes)
     if own.servers and own.served is None:
         own = replace(own, served=_find_model_name(agent))
-    return _run(_find_task(env_or_task, task_options, own), arm_recipes(agent, arms), own)
+    return _run(_find_task(env_or_task, task_options, own), arm_recipes(agent, arms), own, more_arms)
 
 
 def run_arms(
@@ -77,13 +79,14 @@ def run_arms(
     agents: Mapping[str, Any],
     episodes: int | None = None,
     *,
+    more_arms: bool = False,
     config: RunConfig | None = None,
     **settings: Any,
 ) -> RunLog:
     """Run several named agents on the same episodes; see `evaluate` for the rest."""
     own, task_options = take_settings(config, settings, episodes)
     recipes = {name: agent_recipe(agent) for name, agent in agents.items()}
-    return _run(_find_task(env_or_task, task_options, own), recipes, own)
+    return _run(_find_task(env_or_task, task_options, own), recipes, own, more_arms)
 
 
 def _find_model_name(agent: Any) -> str | None:
@@ -153,7 +156,7 @@ def resume_run(
     return _finish(store, task, agents, workers, progress, place, retry_errors=retry_errors)
 
 
-def _run(task: Any, agents: Mapping[str, Any], settings: RunConfig) -> RunLog:
+def _run(task: Any, agents: Mapping[str, Any], settings: RunConfig, more_arms: bool) -> RunLog:
     require_servable(agents, settings.place)
     if settings.lpips is not None:
         Lpips(settings.lpips)  # report missing weights before anything is run
@@ -172,10 +175,13 @@ def _run(task: Any, agents: Mapping[str, Any], settings: RunConfig) -> RunLog:
     if settings.shard is not None:
         Shard.parse(settings.shard).select(count)
     if settings.resume and settings.out is not None and RunStore.exists(settings.out):
-        store = RunStore.resume(settings.out, config, settings.scratch)
+        store = RunStore.resume(settings.out, config, settings.scratch, more_arms)
+        begun_with = [arm["name"] for arm in store.config["arms"]]
         require_left(built, store, agents)
-        require_own_sources(store, task, agents)
+        require_own_sources(store, task, {arm: agents[arm] for arm in begun_with})
         _take_over(store, settings)
+        if len(agents) > len(begun_with):
+            _add_arms(store, config, _describe_agents(task, agents, built, count))
     else:
         started, salt = time.perf_counter(), _choose_salt(settings)
         episodes = built.episodes(count)
@@ -184,9 +190,7 @@ def _run(task: Any, agents: Mapping[str, Any], settings: RunConfig) -> RunLog:
         info = {
             "platform": describe_platform(),
             "task": task.to_json(),
-            "agents": {arm: recipe.to_json() for arm, recipe in agents.items()},
-            "sources": sources_of(task, agents),
-            "departures": describe_departures(built, agents, count),
+            **_describe_agents(task, agents, built, count),
             "pictures": pool_episodes(
                 episodes if looks is None else episodes[: looks.every], settings.count_pictured(count)
             ),
@@ -223,6 +227,30 @@ def _choose_salt(settings: RunConfig) -> str:
             f"them, say, --salt {keys.draw_salt()} (salt=)"
         )
     return keys.draw_salt() if settings.salt is None else settings.salt
+
+
+def _describe_agents(task: Any, agents: Mapping[str, Any], built: Any, count: int) -> dict[str, Any]:
+    """Return what a run store keeps of all arms."""
+    return {
+        "agents": {arm: recipe.to_json() for arm, recipe in agents.items()},
+        "sources": sources_of(task, agents),
+        "departures": describe_departures(built, agents, count),
+    }
+
+
+def _add_arms(store: RunStore, config: dict[str, Any], info: Mapping[str, Any]) -> None:
+    """Add the arms that a resumed run lacks; closes the store where they must not be added.
+
+    Raises:
+        StoreError: a rule looks at the run's arms to stop it early, and has not looked at these.
+    """
+    if "until" in store.info:
+        store.close()
+        raise StoreError(
+            f"{store.path}: a run that a rule may stop early (--until) has the arms that it was begun with; run the "
+            "new ones in another folder"
+        )
+    store.add_arms(config, info)
 
 
 def _take_over(store: RunStore, settings: RunConfig) -> None:

@@ -430,7 +430,7 @@ def _summarise(
         Sample(
             arm.label,
             outcomes[arm.label],
-            add_paper_quality({name: _by_episode(own) for name, own in arm.scores.items() if own}, ranges),
+            add_paper_quality({name: _average_by_episode(own) for name, own in arm.scores.items() if own}, ranges),
             len(arm.frames),
         )
         for arm in arms
@@ -460,7 +460,7 @@ def _list_outcomes(arm: _Arm) -> list[dict[str, Any]]:
     return [row for row in arm.log.store.outcomes() if row["arm"] == arm.name]
 
 
-def _by_episode(scores: Mapping[FrameKey, float]) -> dict[int, float]:
+def _average_by_episode(scores: Mapping[FrameKey, float]) -> dict[int, float]:
     """Return the mean over the frames of each episode."""
     values: dict[int, list[float]] = {}
     for key in sorted(scores):

@@ -123,7 +123,7 @@ def scale(
     """
     if agent.model is None:
         raise ArgumentError("scale: expected an agent with a world model, got one without")
-    amounts = _amounts(candidates, imagine_fraction)
+    amounts = _list_amounts(candidates, imagine_fraction)
     agents = {f"{sweep}={value:g}": _with(agent, changes) for (sweep, value), changes in amounts.items()}
     own, task_options = take_settings(config, settings)
     if own.shard is not None:
@@ -134,10 +134,10 @@ def scale(
     out = own.out or Path("runs") / f"scale-{datetime.now():%Y%m%d-%H%M%S}"
     run_config = replace(own, out=out, keep_images=0, episodes=own.episodes or EPISODES)
     log = run_arms(env_or_task, agents, config=run_config, **task_options)
-    return Scaling(log, _points(log, {f"{sweep}={value:g}": (sweep, value) for sweep, value in amounts}))
+    return Scaling(log, _measure_points(log, {f"{sweep}={value:g}": (sweep, value) for sweep, value in amounts}))
 
 
-def _amounts(
+def _list_amounts(
     candidates: Sequence[int] | None, fractions: Sequence[float] | None
 ) -> dict[tuple[str, float], dict[str, Any]]:
     """Return the options of the agent for each (sweep, value)."""
@@ -162,7 +162,7 @@ def _with(agent: Any, changes: Mapping[str, Any]) -> Any:
     return replace(agent_recipe(agent), **changes)
 
 
-def _points(log: RunLog, amounts: Mapping[str, tuple[str, float]]) -> tuple[ScalePoint, ...]:
+def _measure_points(log: RunLog, amounts: Mapping[str, tuple[str, float]]) -> tuple[ScalePoint, ...]:
     """Return one point per arm that has a scored episode."""
     summary, found = log.numbers(), []
     for line in costs(log):

@@ -101,8 +101,9 @@ def study(
         found.summary()
         found.save()                       # study.html, study.json and figures
 
-    A second call goes on where the first one stopped. Rollouts of models that are cacheable and answers of language
-    models are kept, so that no run asks for what another has.
+    A second call goes on where the first one stopped. The file may have gained runs and arms since, which are run
+    beside those that are there; anything else must be as it was. Rollouts of models that are cacheable and answers of
+    language models are kept, so that no run asks for what another has.
 
     Args:
         name: of a shipped study (`wiw list studies`), or the path of a YAML file.
@@ -114,7 +115,7 @@ def study(
 
     Raises:
         ArgumentError: no such study, or one that cannot be run; says where in the file.
-        StoreError: the folder holds runs of other settings.
+        StoreError: the folder holds runs of other settings, or with arms that are changed or left out now.
     """
     plan = load_study(name, variables, small)
     folder = Path(out) if out is not None else Path("runs") / f"study-{Path(name).stem}"
@@ -150,7 +151,7 @@ def _require(run: StudyRun) -> None:
 def _run(run: StudyRun, folder: Path, workers: int, progress: bool) -> StudyPart:
     """Run one run, or what is left of it, and measure what the study asks of it."""
     settings = replace(run.settings, out=folder / run.name, resume=True, workers=workers, progress=progress)
-    log = run_arms(run.task, run.agents, config=settings)
+    log = run_arms(run.task, run.agents, more_arms=True, config=settings)
     imagined = {line.arm: line.calls.get("rows", 0.0) / line.episodes for line in costs(log) if line.episodes}
     table = None if run.quality is None else quality(log, **run.quality).table
     everyone = {arm: imagined.get(arm, 0.0) for arm in log.arms}

@@ -26,12 +26,10 @@ runs:
 from __future__ import annotations
 
 import re
-from collections.abc import Collection, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, fields
-from inspect import formatannotation
 from pathlib import Path
-from types import UnionType
-from typing import Any, Literal, Union, get_args, get_origin, get_type_hints
+from typing import Any
 
 import yaml
 
@@ -41,6 +39,7 @@ from wiw.runs.arm_text import check_arm_name, split_arms
 from wiw.runs.config import RunConfig
 from wiw.runs.recipes import AgentRecipe, TaskRecipe, absolute, arm_recipes, require_reference
 from wiw.suggestions import did_you_mean
+from wiw.typed_values import read_values, require_known
 
 FOLDER = Path(__file__).parents[1] / "configs" / "studies"
 PLOTS = ("success", "rollouts", "quality")
@@ -139,7 +138,7 @@ def load_study(study: str | Path, variables: Mapping[str, Any] | None = None, sm
     """
     path = find_study(study)
     content = _read(path)
-    _require_known(content, _KEYS, str(path))
+    require_known(content, _KEYS, str(path))
     values = _fill_variables(content, variables or {}, small, str(path))
     filled = {name: _substitute(content.get(name), values, f"{path}: {name}") for name in _KEYS[:3] + _KEYS[5:]}
     runs = _require_mapping(filled["runs"], f"{path}: runs")
@@ -159,8 +158,8 @@ def _fill_variables(content: Mapping[str, Any], given: Mapping[str, Any], small:
     """Return the value of each variable: given, else the small one if asked for, else the file's own."""
     own = _require_mapping(content.get("variables") or {}, f"{where}: variables")
     less = _require_mapping(content.get("small") or {}, f"{where}: small")
-    _require_known(less, own, f"{where}: small")
-    _require_known(given, own, "study: --set")
+    require_known(less, own, f"{where}: small")
+    require_known(given, own, "study: --set")
     return {**own, **(less if small else {}), **given}
 
 
@@ -172,26 +171,26 @@ def _substitute(value: Any, variables: Mapping[str, Any], where: str) -> Any:
         return [_substitute(each, variables, where) for each in value]
     if not isinstance(value, str):
         return value
-    _require_known(_VARIABLE.findall(value), variables, where)
+    require_known(_VARIABLE.findall(value), variables, where)
     whole = _VARIABLE.fullmatch(value)
     return variables[whole[1]] if whole else _VARIABLE.sub(lambda found: str(variables[found[1]]), value)
 
 
 def _read_run(name: str, content: Any, shared: Mapping[str, Any], where: str) -> StudyRun:
     """Return one run of a study; `shared` are settings of all runs."""
-    _require_known(_require_mapping(content, where), _RUN_KEYS, where)
+    require_known(_require_mapping(content, where), _RUN_KEYS, where)
     check_arm_name(name, where)
     agents = _read_arms(content.get("arms"), content.get("agent") or {}, where)
     pairs = tuple((str(arm), str(base)) for arm, base in _require_pairs(content.get("compare") or [], where))
     pairs = tuple(pair for pair in pairs if all(arm in agents for arm in pair) or _refuse_pair(pair, content, where))
     plots = tuple(content.get("plots") or ("success",))
-    _require_known(plots, PLOTS, f"{where}: plots")
+    require_known(plots, PLOTS, f"{where}: plots")
     quality = _require_mapping(content.get("quality") or {}, f"{where}: quality") if "quality" in plots else None
-    _require_known(quality or {}, _QUALITY_KEYS, f"{where}: quality")
+    require_known(quality or {}, _QUALITY_KEYS, f"{where}: quality")
     settings = {**shared, **_require_mapping(content.get("settings") or {}, f"{where}: settings")}
     known = [field.name for field in fields(RunConfig) if field.name not in _OWN_SETTINGS]
-    _require_known(settings, known, f"{where}: settings")
-    _require_types(RunConfig, settings, f"{where}: settings")
+    require_known(settings, known, f"{where}: settings")
+    settings = read_values(RunConfig, settings, f"{where}: settings")
     options = _require_mapping(content.get("task_options") or {}, f"{where}: task_options")
     task = TaskRecipe(str(content.get("task", "imagenav")), dict(options))
     return StudyRun(name, _give_seed(task, settings), agents, RunConfig(**settings), pairs, plots, quality)
@@ -221,8 +220,8 @@ def _read_arms(arms: Any, agent: Any, where: str) -> dict[str, AgentRecipe]:
 
 
 def _make_agent(values: Mapping[str, Any], where: str) -> AgentRecipe:
-    _require_known(values, _AGENT_KEYS, where)
-    _require_types(AgentRecipe, values, where)
+    require_known(values, _AGENT_KEYS, where)
+    values = read_values(AgentRecipe, values, where)
     if "policy" not in values:
         raise ArgumentError(f"{where}: expected a policy, here or in `agent`, got none")
     parts = {name: absolute(str(values[name])) for name in ("policy", "model", "reviser") if values.get(name)}
@@ -246,7 +245,7 @@ def _refuse_pair(pair: tuple[str, str], content: Mapping[str, Any], where: str) 
         ArgumentError: the file names no such arm.
     """
     arms = content.get("arms")
-    _require_known(pair, arms if isinstance(arms, Mapping) else (), f"{where}: compare")
+    require_known(pair, arms if isinstance(arms, Mapping) else (), f"{where}: compare")
     return False
 
 
@@ -260,43 +259,3 @@ def _require_mapping(value: Any, where: str) -> Mapping[str, Any]:
     if not isinstance(value, Mapping):
         raise ArgumentError(f"{where}: expected `name: value` lines, got {value!r}")
     return value
-
-
-def _require_types(declared: type, values: Mapping[str, Any], where: str) -> None:
-    """Check that values are of the types that a dataclass declares for the fields of their names.
-
-    Raises:
-        ArgumentError: one is not; names `where`, the field and its type.
-    """
-    kinds = get_type_hints(declared)
-    for name, value in values.items():
-        if not _fits(value, kinds[name]):
-            raise ArgumentError(f"{where}: {name}: expected {formatannotation(kinds[name])}, got {value!r}")
-
-
-def _fits(value: Any, kind: Any) -> bool:
-    """Return whether a value of a YAML file is of a type; texts are paths, too, and whole numbers are floats."""
-    origin = get_origin(kind)
-    if origin in (Union, UnionType):
-        return any(_fits(value, each) for each in get_args(kind))
-    if origin is Literal:
-        return value in get_args(kind)
-    if kind in (int, float):
-        return isinstance(value, int | kind) and not isinstance(value, bool)
-    if origin is Sequence:
-        return isinstance(value, Sequence) and not isinstance(value, str)
-    return kind is Any or isinstance(value, str if kind is Path else origin or kind)
-
-
-def _require_known(names: Collection[Any], known: Collection[str], where: str) -> None:
-    """Check that all names are known.
-
-    Raises:
-        ArgumentError: some are not; names `where`, what is like them, and what there is.
-    """
-    unknown = [str(name) for name in names if name not in known]
-    if unknown:
-        there = ", ".join(known) or "none"
-        raise ArgumentError(
-            f"{where}: unknown name '{unknown[0]}'; there are {there}.{did_you_mean(unknown[0], list(known))}"
-        )

@@ -18,6 +18,7 @@ from wiw.render import resolve_backend
 from wiw.scenes import absolute, resolve
 from wiw.tasks import presets
 from wiw.tasks.base import Task
+from wiw.typed_values import require_known
 from wiw.types import Episode, check_seed
 
 
@@ -54,7 +55,7 @@ class NavigationTask(NavigationSpec, Task):
         **rules: Any,
     ) -> None:
         own, generator = presets.rule_names(self.rules_class), presets.rule_names(self.generator_class)
-        presets.refuse_unknown(rules, [*own, *generator], f"options of {self.name}")
+        require_known(rules, [*own, *generator], f"options of {self.name}", "rule")
         self.overridden = {name: value for name, value in rules.items() if name in own}
         """Rules that were given as options."""
         owner = presets.find_owner(type(self))

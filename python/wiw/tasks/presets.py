@@ -18,14 +18,15 @@ departures:           # why it departs from the paper, by whom that concerns (`C
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import MISSING, Field, dataclass, field, fields
 from pathlib import Path
-from typing import Any, Literal, TypeVar, get_args, get_origin, get_type_hints
+from typing import Any, TypeVar
 
 from wiw.errors import ArgumentError
 from wiw.mapping_files import read_yaml_mapping
 from wiw.suggestions import did_you_mean
+from wiw.typed_values import read_values
 
 FOLDER = Path(__file__).parents[1] / "configs"
 DEFAULT, PAPER = "default", "paper"
@@ -69,10 +70,10 @@ def load_preset(task: str, preset: str | Path) -> Preset:
     models: dict[str, dict[str, Any]] = {}
     reasons: dict[str, dict[str, Any]] = {}
     policy: str | None = None
-    for path in _chain(task, preset):
+    for path in _list_files(task, preset):
         content = _read(path)
         policy = _read_policy(content, path) or policy
-        rules |= _without_header(content)
+        rules |= _drop_header(content)
         generator |= _read_generator_rules(content, path)
         _add_options(policies, _read_options(content, "policies", path))
         _add_options(models, _read_options(content, "models", path))
@@ -115,9 +116,9 @@ def load_rules(cls: type[Rules], task: str, preset: str | Path, overrides: Mappi
         FileError: the file cannot be read, or does not hold a mapping.
     """
     values: dict[str, Any] = {}
-    for path in _chain(task, preset):
-        values |= check_values(cls, _without_header(_read(path)), str(path))
-    values |= check_values(cls, overrides, f"options of {task}")
+    for path in _list_files(task, preset):
+        values |= read_values(cls, _drop_header(_read(path)), str(path), "rule")
+    values |= read_values(cls, overrides, f"options of {task}", "rule")
     missing = [field.name for field in _open_fields(cls) if field.name not in values]
     if missing:
         ships = f"; give `base: {DEFAULT}`" if list_presets(task) else f", or give {cls.__name__} defaults"
@@ -130,35 +131,12 @@ def rule_names(cls: type) -> list[str]:
     return [field.name for field in fields(cls)]
 
 
-def check_values(cls: type, values: Mapping[str, Any], where: str) -> dict[str, Any]:
-    """Return the values, with whole numbers made floats where a rule is a float.
-
-    Raises:
-        ArgumentError: a name that is no rule, or a value of another type; names `where`.
-    """
-    refuse_unknown(values, rule_names(cls), where)
-    types = get_type_hints(cls)
-    return {name: _typed(types[name], value, f"{where}: {name}") for name, value in values.items()}
-
-
-def refuse_unknown(values: Iterable[str], known: Sequence[str], where: str) -> None:
-    """Check that all names are known.
-
-    Raises:
-        ArgumentError: some are not; names `where`, what is like them, and what there is.
-    """
-    unknown = [str(name) for name in values if name not in known]
-    if unknown:
-        hint = did_you_mean(unknown[0], known)
-        raise ArgumentError(f"{where}: unknown rules {', '.join(unknown)}; there are {', '.join(known)}.{hint}")
-
-
 def _open_fields(cls: type) -> list[Field[Any]]:
     """Return the rules that have no default."""
     return [field for field in fields(cls) if field.default is MISSING and field.default_factory is MISSING]
 
 
-def _chain(task: str, preset: str | Path) -> list[Path]:
+def _list_files(task: str, preset: str | Path) -> list[Path]:
     """Return the files of a preset, what it is based on first."""
     path = _find(task, preset)
     if path is None:
@@ -171,7 +149,7 @@ def _chain(task: str, preset: str | Path) -> list[Path]:
         raise ArgumentError(
             f"{path}: base '{base}' is not one of {', '.join(shipped) or '(none)'}.{did_you_mean(str(base), shipped)}"
         )
-    return [*_chain(task, base), path]
+    return [*_list_files(task, base), path]
 
 
 def _find(task: str, preset: str | Path) -> Path | None:
@@ -194,7 +172,7 @@ def _read(path: Path) -> Mapping[str, Any]:
     return read_yaml_mapping(path, "rules as `name: value` lines")
 
 
-def _without_header(content: Mapping[str, Any]) -> dict[str, Any]:
+def _drop_header(content: Mapping[str, Any]) -> dict[str, Any]:
     return {name: value for name, value in content.items() if name not in HEADER}
 
 
@@ -240,14 +218,3 @@ def _read_departures(content: Mapping[str, Any], path: Path) -> Options:
             f"`rules: {{decisions: why}}`, got {reasons!r}"
         )
     return dict(reasons)
-
-
-def _typed(kind: Any, value: Any, where: str) -> Any:
-    if get_origin(kind) is Literal:
-        fits, expected = value in get_args(kind), f"one of {', '.join(get_args(kind))}"
-    else:
-        numbers = (int, float) if kind is float else (kind,)
-        fits, expected = isinstance(value, numbers) and not isinstance(value, bool), f"a value of type {kind.__name__}"
-    if not fits:
-        raise ArgumentError(f"{where}: expected {expected}, got {value!r}")
-    return float(value) if kind is float else value

@@ -18,7 +18,7 @@ from wiw.errors import ArgumentError
 from wiw.networks import has_bfloat16
 from wiw.training.checkpoint import Checkpoint, ResumableTrainer
 from wiw.training.plays import POSES, Plays
-from wiw.training.trainer import run_training, warmup_cosine_schedule
+from wiw.training.trainer import apply_gradients, run_training, warmup_cosine_schedule
 from wiw.world_models.armnet.body import render_bare_table
 from wiw.world_models.armnet.motion import motion as motion_of
 from wiw.world_models.armnet.network import (
@@ -126,9 +126,6 @@ class _Trainer(ResumableTrainer):
 
     def train_step(self, learning_rate: float) -> float:
         """Train on one batch of short sequences and return its loss."""
-        for group in self.optimiser.param_groups:
-            group["lr"] = float(learning_rate)
-        self.optimiser.zero_grad(set_to_none=True)
         recipe, total = self.recipe, 0.0
         rng = np.random.default_rng(core.fold_key([recipe.seed, 0xA112, self.step_count]))
         self.step_count += 1
@@ -139,8 +136,7 @@ class _Trainer(ResumableTrainer):
             loss = _compute_loss(part, recipe) * len(part.prediction) / (recipe.batch * recipe.steps)
             loss.backward()
             total += float(loss.detach())
-        torch.nn.utils.clip_grad_norm_(self.network.parameters(), 1.0)
-        self.optimiser.step()
+        apply_gradients(self.optimiser, self.network, learning_rate)
         return total
 
 

@@ -24,7 +24,7 @@ from wiw.policies.diffuser.network import Network, Shape, Views, stack_views
 from wiw.policies.diffuser.paths import MIDDLE, to_vectors
 from wiw.policies.diffuser.workspace import PinholeCamera, WorkspaceView
 from wiw.training.checkpoint import Checkpoint, ResumableTrainer
-from wiw.training.trainer import run_training, warmup_cosine_schedule
+from wiw.training.trainer import apply_gradients, run_training, warmup_cosine_schedule
 
 if TYPE_CHECKING:
     from wiw.datasets.demonstrations import Demonstration
@@ -193,15 +193,11 @@ class _Trainer(ResumableTrainer):
 
     def train_step(self, learning_rate: float) -> float:
         """Train on one batch of samples and return its loss."""
-        for group in self.optimiser.param_groups:
-            group["lr"] = float(learning_rate)
         key = core.fold_key([self.recipe.seed, 0xD1F2, self.step_count])
         batch = sample_batch(self.samples, self.recipe.batch, self.recipe.tilt, np.random.default_rng(key))
         loss = self._compute_loss(batch, torch.Generator().manual_seed(key % 2**63))
-        self.optimiser.zero_grad(set_to_none=True)
         loss.backward()
-        torch.nn.utils.clip_grad_norm_(self.network.parameters(), 1.0)
-        self.optimiser.step()
+        apply_gradients(self.optimiser, self.network, learning_rate)
         self.step_count += 1
         self._update_average(min(self.recipe.average, self.step_count / (self.step_count + 9)))
         return float(loss.detach())

@@ -24,7 +24,7 @@ from wiw.policies.navigator.estimator import GoalEstimator, PlaceEstimates
 from wiw.policies.navigator.network import DISTANCES, HEADINGS, Estimate, Network, to_input
 from wiw.training.checkpoint import Checkpoint, ResumableTrainer
 from wiw.training.goal_places import GoalPlaces
-from wiw.training.trainer import run_training, warmup_cosine_schedule
+from wiw.training.trainer import apply_gradients, run_training, warmup_cosine_schedule
 
 NEAR, FAR = 2.0, 9.0
 """Metres: below the first a goal counts as near; pairs farther apart than the second are not evaluated."""
@@ -115,8 +115,6 @@ class _Trainer(ResumableTrainer):
 
     def train_step(self, learning_rate: float) -> float:
         """Train on the pairs of a few scenes and return their loss."""
-        for group in self.optimiser.param_groups:
-            group["lr"] = float(learning_rate)
         recipe = self.recipe
         key = core.fold_key([recipe.seed, 0x4C32, self.step_count])
         rng = np.random.default_rng(key)
@@ -133,11 +131,9 @@ class _Trainer(ResumableTrainer):
                 for rows in torch.arange(len(places.keys)).split([len(batch.places) for batch in batches])
             ]
         losses = [_compute_loss(own, batch, recipe) for own, batch in zip(found, batches, strict=True)]
-        self.optimiser.zero_grad(set_to_none=True)
         loss = torch.stack(losses).mean()
         loss.backward()
-        torch.nn.utils.clip_grad_norm_(self.network.parameters(), 1.0)
-        self.optimiser.step()
+        apply_gradients(self.optimiser, self.network, learning_rate)
         return float(loss.detach())
 
 

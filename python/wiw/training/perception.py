@@ -34,7 +34,7 @@ from wiw.perception.learned_labeller import LearnedLabeller
 from wiw.perception.scene_labels import CATEGORIES, STATES
 from wiw.training.checkpoint import Checkpoint, ResumableTrainer
 from wiw.training.labelled_views import LabelledViews, compute_view_tangents
-from wiw.training.trainer import run_training, warmup_cosine_schedule
+from wiw.training.trainer import apply_gradients, run_training, warmup_cosine_schedule
 
 LEAST_CELLS = 40
 """Cells that an object must fill for its state to be evaluated."""
@@ -157,8 +157,6 @@ class _Trainer(ResumableTrainer):
 
     def train_step(self, learning_rate: float) -> float:
         """Train on one batch of views and return its loss."""
-        for group in self._optimiser.param_groups:
-            group["lr"] = learning_rate
         rng = np.random.default_rng(core.fold_key([self.recipe.seed, 0x4C22, self.step_count]))
         coarse = learning_rate > self.recipe.coarse * self.recipe.rate
         batch = sample_batch(self.views, self.recipe, self._sampling_weights, rng, coarse)
@@ -176,10 +174,8 @@ class _Trainer(ResumableTrainer):
             loss = loss + self.recipe.auxiliary * self._compute_category_loss(logits.permute(0, 2, 3, 1), middles)
         if (state > 0).any():
             loss = loss + self.recipe.states * self._compute_state_loss(state_logits, category, state)
-        self._optimiser.zero_grad(set_to_none=True)
         loss.backward()
-        torch.nn.utils.clip_grad_norm_(self.network.parameters(), 1.0)
-        self._optimiser.step()
+        apply_gradients(self._optimiser, self.network, learning_rate)
         self.step_count += 1
         return float(loss.detach())
 

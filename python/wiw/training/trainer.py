@@ -10,6 +10,9 @@ from dataclasses import replace
 from typing import Any, Protocol, TypeVar, cast
 
 import numpy as np
+from torch.nn import Module
+from torch.nn.utils import clip_grad_norm_
+from torch.optim import Optimizer
 
 from wiw.errors import ArgumentError
 from wiw.training.checkpoint import Checkpoint, ResumableTrainer
@@ -72,6 +75,15 @@ def run_training(
         if checkpoint:
             checkpoint.save_if_due(cast(ResumableTrainer, trainer), recipe.epochs, step + 1)
     return trainer, recipe
+
+
+def apply_gradients(optimiser: Optimizer, network: Module, learning_rate: float) -> None:
+    """Update weights at a learning rate by their gradients, those of the network clipped to norm 1; clear these."""
+    for group in optimiser.param_groups:
+        group["lr"] = float(learning_rate)
+    clip_grad_norm_(network.parameters(), 1.0)
+    optimiser.step()
+    optimiser.zero_grad(set_to_none=True)
 
 
 def warmup_cosine_schedule(warmup: float, floor: float = 0.005) -> Callable[[float], float]:

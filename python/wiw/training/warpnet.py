@@ -19,7 +19,7 @@ from wiw.errors import ArgumentError
 from wiw.networks import has_bfloat16
 from wiw.reproject import pose, warp
 from wiw.training.reduced_frames import compute_log_distances
-from wiw.training.trainer import run_training, warmup_cosine_schedule
+from wiw.training.trainer import apply_gradients, run_training, warmup_cosine_schedule
 from wiw.training.walks import Walks, find_straight_paths
 from wiw.world_models.warpnet.model import WarpNet, to_network
 from wiw.world_models.warpnet.network import Network, Prediction
@@ -91,16 +91,12 @@ class _Trainer:
 
     def train_step(self, learning_rate: float) -> float:
         """Train on one batch of pairs and return its loss."""
-        for group in self._optimiser.param_groups:
-            group["lr"] = learning_rate
         pairs = sample_pairs(self.walks, self.recipe.batch, self._rng)
         with torch.autocast("cpu", torch.bfloat16, enabled=self.recipe.bfloat16 and has_bfloat16()):
             found = self.network.train()(pairs.source, pairs.ahead)
         loss = compute_losses(found, pairs, self.recipe).mean()
-        self._optimiser.zero_grad(set_to_none=True)
         loss.backward()
-        torch.nn.utils.clip_grad_norm_(self.network.parameters(), 1.0)
-        self._optimiser.step()
+        apply_gradients(self._optimiser, self.network, learning_rate)
         return float(loss.detach())
 
 

@@ -12,9 +12,9 @@ from matplotlib.figure import Figure
 from numpy.typing import NDArray
 
 from wiw.errors import ArgumentError
-from wiw.report.cuts import BAND, FRONT, part
-from wiw.report.plans import glyphs, is_primitive_plan, numbers
-from wiw.report.stage import signs
+from wiw.report.cuts import BAND, FRONT, cut_part
+from wiw.report.plans import format_glyphs, is_primitive_plan, numbers
+from wiw.report.stage import format_signs
 from wiw.runs.rows import select_frames
 from wiw.tabletop.workbench import SHUT
 from wiw.types import ArmObservation, Decision, Observation, Rollout
@@ -70,15 +70,15 @@ def _choose_picture(observation: Observation | ArmObservation) -> tuple[NDArray[
     if isinstance(observation, ArmObservation):
         return observation.front, "seen from the front"
     panorama = observation.as_dict()["panorama"]
-    return part(panorama, BAND, (0, 1)), "seen, all around"
+    return cut_part(panorama, BAND, (0, 1)), "seen, all around"
 
 
 def _describe_plan(decision: Decision, index: int) -> str:
     """Return a plan in signs."""
     actions, here = decision.proposals[index].actions.tolist(), decision.observation
     if isinstance(here, ArmObservation):
-        return signs(actions, here.pose[:3].tolist(), bool(here.pose[6] < SHUT))
-    return " ".join(glyphs(actions)) if is_primitive_plan(actions) else numbers(actions)
+        return format_signs(actions, here.pose[:3].tolist(), bool(here.pose[6] < SHUT))
+    return " ".join(format_glyphs(actions)) if is_primitive_plan(actions) else numbers(actions)
 
 
 def _candidate(figure: Figure, place: Any, decision: Decision, index: int, scores: NDArray[np.float64]) -> None:
@@ -115,7 +115,7 @@ def _front(frame: NDArray[np.uint8]) -> NDArray[np.uint8]:
     """Return the first of several views; of a panorama the part towards which the agent looks."""
     view = frame[0] if frame.ndim == 4 else frame
     height, width = view.shape[:2]
-    return view if width <= 1.6 * height else part(view, BAND, FRONT)
+    return view if width <= 1.6 * height else cut_part(view, BAND, FRONT)
 
 
 def _picture(axes: Axes, image: NDArray[np.uint8], title: str, size: int = 9) -> None:

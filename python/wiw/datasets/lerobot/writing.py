@@ -122,11 +122,13 @@ class _Writer:
 
     def _write_file(self) -> None:
         path = self._folder / DATA.format(**self._place)
-        write_row_groups(path, self._schema, self._waiting, use_dictionary=False, compression=self._packing())
+        write_row_groups(
+            path, self._schema, self._waiting, use_dictionary=False, compression=self._choose_compression()
+        )
         self._waiting = []
         self._files += 1
 
-    def _packing(self) -> dict[str, str]:
+    def _choose_compression(self) -> dict[str, str]:
         """Return the compression of each column; pictures are packed already."""
         packing: dict[str, str] = {}
         for name, each in self._features.items():

@@ -18,6 +18,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from wiw._core import core
+from wiw.datasets.fields import to_position
 from wiw.datasets.questions.answers import Fact, find_answer, propose
 from wiw.datasets.questions.colors import name_rendered_color
 from wiw.datasets.questions.facts import SceneTable, make_table
@@ -163,7 +164,7 @@ class Surroundings:
             slots=dict(slots),
             fact=fact,
             start=start,
-            start_position=_triple(self.survey.points[start]),
+            start_position=to_position(self.survey.points[start]),
             start_yaw=float(2 * np.pi * draws[1]),
             geodesic=float(lengths[start]),
             viewpoints=chosen,
@@ -184,14 +185,14 @@ class Surroundings:
     def _viewpoint(self, fact: Fact, views: list[NDArray[np.bool_]], sight: int, place: int) -> Viewpoint:
         """Return a place with the heading in which the first thing of a sight looks largest."""
         shares = np.where(views[sight][place], self.survey.shares[place, :, fact.sights[sight].things[0]], -1.0)
-        return (*_triple(self.survey.points[place]), float(self.survey.headings[int(shares.argmax())]))
+        return (*to_position(self.survey.points[place]), float(self.survey.headings[int(shares.argmax())]))
 
     def _rendered_color(self, instance: int, view: NDArray[np.bool_]) -> str:
         """Return what a colour is called where the instance looks largest, and where it looks of middling size."""
         shares = np.where(view, self.survey.shares[:, :, instance], 0.0)
         ranked = [int(i) for i in np.argsort(-shares.ravel(), kind="stable")[: int((shares > 0).sum())]]
         at = [divmod(i, shares.shape[1]) for i in dict.fromkeys([ranked[0], ranked[len(ranked) // 2]])]
-        viewpoints = [(*_triple(self.survey.points[i]), float(self.survey.headings[yaw])) for i, yaw in at]
+        viewpoints = [(*to_position(self.survey.points[i]), float(self.survey.headings[yaw])) for i, yaw in at]
         return name_rendered_color(self.place, instance, viewpoints, self.rules.clear)
 
 
@@ -331,7 +332,3 @@ def _walk(distances: NDArray[np.float64], start: int, stops: list[NDArray[np.int
         here = int(places[int((distances[here, places] + rest[places]).argmin())])
         route.append(here)
     return route
-
-
-def _triple(point: NDArray[np.float64]) -> tuple[float, float, float]:
-    return float(point[0]), float(point[1]), float(point[2])

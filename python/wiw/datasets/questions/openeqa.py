@@ -17,7 +17,7 @@ import numpy as np
 
 from wiw._core import core
 from wiw.datasets.episodes import read_json
-from wiw.datasets.fields import name_of, number, point, text
+from wiw.datasets.fields import name_of, number, point, text, to_position
 from wiw.datasets.habitat import heading_of, yaw_of
 from wiw.datasets.questions.question import CATEGORIES, Question
 from wiw.datasets.questions.survey import choose_places
@@ -185,17 +185,13 @@ def locate_start(world: World, episode: Episode) -> Episode:
     if np.isnan(start).any():
         key = core.fold_key([0x0E0A, *episode.episode_id.encode()])
         places = choose_places(world, _PLACES, key)
-        return replace(episode, start_position=_triple(places[0]))
+        return replace(episode, start_position=to_position(places[0]))
     nearest = np.asarray(world.navmesh.snap(start), np.float64)
     away = float(np.linalg.norm(nearest - start))
     if not away <= NEAR:
         raise FileError(
-            f"episode {episode.episode_id}: start_position {_triple(start)} is not on the navigation mesh of "
-            f"{world.name}; the nearest place, {_triple(nearest)}, is {away:.2f} m away, expected at most {NEAR} m: is "
-            "this the scene of the question?"
+            f"episode {episode.episode_id}: start_position {to_position(start)} is not on the navigation mesh of "
+            f"{world.name}; the nearest place, {to_position(nearest)}, is {away:.2f} m away, expected at most {NEAR} "
+            "m: is this the scene of the question?"
         )
-    return replace(episode, start_position=_triple(nearest))
-
-
-def _triple(place: Any) -> tuple[float, float, float]:
-    return float(place[0]), float(place[1]), float(place[2])
+    return replace(episode, start_position=to_position(nearest))

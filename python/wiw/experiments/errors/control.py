@@ -161,14 +161,14 @@ class Lag(MotionDegradation):
 
     def change_moves(self, moves: Moves, generator: np.random.Generator) -> Moves:
         """Return no move at first, then the plan's."""
-        return np.concatenate([np.zeros_like(moves), moves])[len(moves) - self._late(moves) :][: len(moves)]
+        return np.concatenate([np.zeros_like(moves), moves])[len(moves) - self._count_late(moves) :][: len(moves)]
 
     def change_poses(self, poses: Poses, generator: np.random.Generator) -> Poses:
         """Return the present pose at first, then the plan's."""
-        late = self._late(poses)
+        late = self._count_late(poses)
         return np.concatenate([np.repeat(poses[:1], late, axis=0), poses])[: len(poses)]
 
-    def _late(self, plan: NDArray[np.float64]) -> int:
+    def _count_late(self, plan: NDArray[np.float64]) -> int:
         return min(round(self.dose), len(plan))
 
 

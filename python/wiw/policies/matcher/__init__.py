@@ -15,7 +15,7 @@ from wiw.action import FORWARD, TURN_LEFT, TURN_RIGHT, to_trajectory
 from wiw.policies.base import FrameSpec, Policy, Situation
 from wiw.policies.matcher import appearance
 from wiw.policies.matcher.exploration import ExplorationMap
-from wiw.policies.options import read_numbers
+from wiw.typed_values import read_values
 from wiw.types import Goal, Key, Proposal, Rollout
 
 HEADINGS = 16
@@ -95,7 +95,7 @@ class Matcher(Policy):
     frames = FrameSpec("panorama", appearance.PANORAMA, source_size=SOURCE)
 
     def __init__(self, **options: Any) -> None:
-        self.options = read_numbers("matcher", MatcherOptions, options)
+        self.options = MatcherOptions(**read_values(MatcherOptions, options, "policy matcher", "option"))
 
     def describe(self) -> dict[str, Any]:
         """Return name and weights."""

@@ -26,8 +26,9 @@ from wiw.policies.navigator.bands import PANORAMA, project_goal
 from wiw.policies.navigator.belief import Evidence, Weights, compute_belief, find_peaks, smooth
 from wiw.policies.navigator.candidates import Candidate, choose_apart, list_candidates, make_candidate, measure_arrivals
 from wiw.policies.navigator.estimator import GoalEstimator, require_torch
-from wiw.policies.navigator.ways import WayMap, Ways, find_near, get_centres
-from wiw.policies.options import read_numbers
+from wiw.policies.navigator.way_cells import WayCells
+from wiw.policies.navigator.ways import WayMap, Ways
+from wiw.typed_values import read_values
 from wiw.types import Goal, Key, Proposal, Rollout
 
 if TYPE_CHECKING:
@@ -36,6 +37,8 @@ if TYPE_CHECKING:
 WEIGHTS = Path(__file__).with_name("weights.safetensors")
 DEPTH_STRIDE = 2
 """Rows and columns of the observed depth between those that the map is made of."""
+NOWHERE = np.empty((0, 2))
+"""No places."""
 
 
 @dataclass(frozen=True)
@@ -135,7 +138,7 @@ class Navigator(Policy):
         require_torch()
         from wiw.policies.navigator.weights import load
 
-        self.options = read_numbers("navigator", NavigatorOptions, options)
+        self.options = NavigatorOptions(**read_values(NavigatorOptions, options, "policy navigator", "option"))
         file = Path(WEIGHTS if weights is None else weights).expanduser()
         self._use_network(*load(file), blake2b(file.read_bytes(), digest_size=8).hexdigest())
 
@@ -143,7 +146,7 @@ class Navigator(Policy):
     def from_network(cls, network: Network, card: dict[str, Any], **options: Any) -> Navigator:
         """Make the policy of a network in memory, such as one in training; `card` has what `measure_prior` returns."""
         policy = cls.__new__(cls)
-        policy.options = read_numbers("navigator", NavigatorOptions, options)
+        policy.options = NavigatorOptions(**read_values(NavigatorOptions, options, "policy navigator", "option"))
         policy._use_network(network, card, "")
         return policy
 
@@ -209,7 +212,7 @@ class Navigator(Policy):
             made = [make_candidate(pose, plan.actions) for plan in plans]
             for plan, future in zip(made, futures, strict=True):
                 self._remember_imagined(memory, plan, future)
-            scores.append(self._evaluate(self._look_out(memory, pose), made))
+            scores.append(self._evaluate(self._look_out(memory, pose, _get_ends(made)), made))
         return scores
 
     # -- evidence ------------------------------------------------------------------------------------------------------
@@ -233,46 +236,57 @@ class Navigator(Policy):
 
     # -- plans ---------------------------------------------------------------------------------------------------------
 
-    def _look_out(self, memory: Memory, pose: NDArray[np.float64]) -> _Outlook:
-        """Return the belief by all evidence, and where it leads the agent, which it remembers."""
+    def _look_out(self, memory: Memory, pose: NDArray[np.float64], included: NDArray[np.float64] = NOWHERE) -> _Outlook:
+        """Return the belief by all evidence, and where it leads the agent, which it remembers.
+
+        The map covers what is within 9 m of the start, and all evidence, the target and `included` [N, 2] beyond.
+        """
         options = self.options
         evidence = [*memory.real, *memory.imagined]
-        way_map = WayMap(memory.grid)
-        ways = way_map.measure_ways(np.array([pose[:2], *(own.pose[:2] for own in evidence)]))
+        places = np.array([pose[:2], *(own.pose[:2] for own in evidence)])
+        target = NOWHERE if memory.target is None else memory.target[None]
+        way_map = WayMap(memory.grid, WayCells.around(np.concatenate([places, target, included])))
+        ways = way_map.measure_ways(places)
         weights = Weights(options.bearing, options.closeness, options.doubt, options.overlap)
         trail = _interpolate(np.array([own.pose[:2] for own in memory.real]))
         belief = compute_belief(way_map, evidence, ways.take(slice(1, None)), trail, self._estimator.centres, weights)
         own = ways.take(slice(0, 1))
         arrivals = measure_arrivals(_stay(pose), own, 0)
-        worth = smooth(belief) * np.exp(-arrivals / options.patience)
-        target = self._choose_target(memory, worth)
-        return _Outlook(way_map, own, belief, worth, target)
+        worth = smooth(way_map.cells, belief) * np.exp(-arrivals / options.patience)
+        return _Outlook(way_map, own, belief, worth, self._choose_target(memory, way_map.cells, worth))
 
-    def _choose_target(self, memory: Memory, worth: NDArray[np.float64]) -> int:
+    def _choose_target(self, memory: Memory, cells: WayCells, worth: NDArray[np.float64]) -> int:
         """Return the cell worth most, or the best one near the last target while that is worth enough beside it."""
         best = int(worth.argmax())
         if memory.target is not None:
-            near = find_near(memory.target, self.options.overlap)
+            near = cells.find_near(memory.target, self.options.overlap)
             kept = int(near[worth[near].argmax()])
             if worth[kept] >= self.options.loyalty * worth[best]:
                 best = kept
-        memory.target = get_centres()[best]
+        memory.target = cells.centres[best]
         return best
 
     def _propose_one(self, situation: Situation, count: int, horizon: int) -> list[Proposal]:
         memory, pose = situation.memory, np.asarray(situation.observation.odometry, np.float64)
         outlook = self._look_out(memory, pose)
-        targets = [outlook.target, *find_peaks(outlook.worth, self.options.targets)]
-        plans = list_candidates(memory.grid, outlook.way_map, outlook.ways, pose, targets, horizon)
+        plans = self._list_plans(memory, outlook, pose, horizon)
+        if not outlook.way_map.cells.contain(_get_ends(plans)):  # a straight run leads off the map
+            outlook = self._look_out(memory, pose, pose[:2] + horizon * STEP * np.array([[-1, -1], [1, 1]]))
+            plans = self._list_plans(memory, outlook, pose, horizon)
         values = self._evaluate(outlook, plans)
         chosen = choose_apart(plans, values, count, self.options.apart)
         return [Proposal(plans[i].actions, prior=float(values[i])) for i in chosen]
 
+    def _list_plans(
+        self, memory: Memory, outlook: _Outlook, pose: NDArray[np.float64], horizon: int
+    ) -> list[Candidate]:
+        targets = [outlook.target, *find_peaks(outlook.way_map.cells, outlook.worth, self.options.targets)]
+        return list_candidates(memory.grid, outlook.way_map, outlook.ways, pose, targets, horizon)
+
     def _evaluate(self, outlook: _Outlook, plans: Sequence[Candidate]) -> NDArray[np.float64]:
         """Return how soon each plan would arrive on average over the belief, 1 for at once and 0 for never."""
         options = self.options
-        ends = np.array([plan.poses[-1, :2] for plan in plans])
-        ways = outlook.way_map.measure_ways(ends)
+        ways = outlook.way_map.measure_ways(_get_ends(plans))
         belief = (1 - options.commitment) * outlook.belief
         belief[outlook.target] += options.commitment
         arrivals = np.stack([measure_arrivals(plan, ways, row) for row, plan in enumerate(plans)])
@@ -282,6 +296,11 @@ class Navigator(Policy):
 def _stay(pose: NDArray[np.float64]) -> Candidate:
     """Return the plan that does nothing."""
     return Candidate(np.zeros(0, np.int8), pose[None])
+
+
+def _get_ends(plans: Sequence[Candidate]) -> NDArray[np.float64]:
+    """Return where plans end: float64 [N, 2]."""
+    return np.array([plan.poses[-1, :2] for plan in plans]).reshape(-1, 2)
 
 
 def _interpolate(places: NDArray[np.float64]) -> NDArray[np.float64]:

@@ -10,7 +10,8 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy import ndimage
 
-from wiw.policies.navigator.ways import SIDE, WayMap, Ways, find_near, get_centres
+from wiw.policies.navigator.way_cells import WayCells
+from wiw.policies.navigator.ways import WayMap, Ways
 
 VISITED = 0.45
 """Metres around where the agent has been in which the goal is not: the episode would have ended."""
@@ -67,7 +68,7 @@ def compute_belief(
         centres: float64 [9]: metres in the middle of each class of distance.
         weights: see `Weights`.
     """
-    total = np.zeros(SIDE * SIDE)
+    total = np.zeros(way_map.cells.count)
     shares = share_weights(np.array([own.pose[:2] for own in evidence]), weights.overlap)
     for row, (own, share) in enumerate(zip(evidence, shares, strict=True)):
         ratio = weights.bearing * rate_bearings(own, ways.azimuths[row], weights.doubt)
@@ -76,7 +77,7 @@ def compute_belief(
     prior = np.where(way_map.open, 1.0, UNKNOWN_PRIOR * way_map.unknown).ravel()
     prior = prior * np.isfinite(ways.metres).all(axis=0)
     for place in trail:
-        prior[find_near(place, VISITED)] = 0
+        prior[way_map.cells.find_near(place, VISITED)] = 0
     if not prior.any():  # every cell has been seen and visited, which a wrong map can bring about
         prior[:] = 1.0
     belief = prior * np.exp(total - total[prior > 0].max())
@@ -99,16 +100,16 @@ def rate_bearings(own: Evidence, azimuths: NDArray[np.float64], doubt: float) ->
     return np.maximum(np.log((1 - doubt) * count * found + doubt), LEAST_LOG)
 
 
-def find_peaks(worth: NDArray[np.float64], count: int) -> list[int]:
+def find_peaks(cells: WayCells, worth: NDArray[np.float64], count: int) -> list[int]:
     """Return the cells of the highest values of [cells], apart from each other, the highest first."""
     rest, found = worth.copy(), list[int]()
     while len(found) < count and rest.max() > 0:
         found.append(int(rest.argmax()))
-        rest[find_near(get_centres()[found[-1]], PEAK_GAP)] = 0
+        rest[cells.find_near(cells.centres[found[-1]], PEAK_GAP)] = 0
     return found
 
 
-def smooth(belief: NDArray[np.float64]) -> NDArray[np.float64]:
+def smooth(cells: WayCells, belief: NDArray[np.float64]) -> NDArray[np.float64]:
     """Return the belief smoothed over neighbouring cells, 0 where it is 0: float64 [cells]."""
-    smoothed = ndimage.gaussian_filter(belief.reshape(SIDE, SIDE), SMOOTHING, mode="constant").ravel()
+    smoothed = ndimage.gaussian_filter(belief.reshape(cells.shape), SMOOTHING, mode="constant").ravel()
     return np.where(belief > 0, smoothed, 0.0)

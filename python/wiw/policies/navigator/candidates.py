@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from wiw.action import FORWARD, TURN_LEFT, to_trajectory
 from wiw.mapping.occupancy import CELL, OccupancyGrid
 from wiw.mapping.routes import HEADINGS, STEP, TURN, follow_heading, route
-from wiw.policies.navigator.ways import WayMap, Ways, crop_layer, find_blocked, find_near, get_centres
+from wiw.policies.navigator.ways import WayMap, Ways, crop_layer, find_blocked
 
 ARRIVAL = 0.45
 """Metres from the goal within which the agent has arrived."""
@@ -89,7 +89,7 @@ def crop_floor(grid: OccupancyGrid, pose: NDArray[np.float64], reach: float) -> 
     row, column = (int(cell) - half for cell in np.floor(pose[:2] / CELL))
     inside = slice(FRAME, 2 * half - FRAME)
     blocked = np.ones((2 * half, 2 * half), bool)
-    blocked[inside, inside] = crop_layer(grid, find_blocked(grid), (row, column), 2 * half)[inside, inside]
+    blocked[inside, inside] = crop_layer(grid, find_blocked(grid), (row, column), (2 * half, 2 * half))[inside, inside]
     return OccupancyGrid(origin=(row, column), free=~blocked, occupied=blocked, walls=np.zeros_like(blocked))
 
 
@@ -97,7 +97,7 @@ def _find_stop(way_map: WayMap, ways: Ways, target: int, horizon: int) -> NDArra
     """Return the last point of the way to a cell that the horizon reaches."""
     cells = way_map.trace(ways, 0, target)
     near = np.flatnonzero(ways.metres[0, cells] <= horizon * STEP)
-    return get_centres()[cells[near[-1]]]
+    return way_map.cells.centres[cells[near[-1]]]
 
 
 def _plan_route(
@@ -127,7 +127,7 @@ def measure_arrivals(candidate: Candidate, ways: Ways, row: int) -> NDArray[np.f
     rest = np.maximum(metres - ARRIVAL, 0) / STEP + np.where(metres > ARRIVAL, np.abs(off) / TURN, 0)
     found = len(candidate.actions) + rest
     for step in reversed(range(len(candidate.poses))):
-        near = find_near(candidate.poses[step, :2], ARRIVAL)
+        near = ways.cells.find_near(candidate.poses[step, :2], ARRIVAL)
         found[near] = np.minimum(found[near], step + 1)
     return found
 

@@ -4,7 +4,6 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from functools import cache
 
 import cv2
 import numpy as np
@@ -15,11 +14,8 @@ from scipy.spatial.distance import cdist
 
 from wiw.mapping.occupancy import CELL as FINE
 from wiw.mapping.occupancy import OccupancyGrid
+from wiw.policies.navigator.way_cells import CELL, WayCells
 
-CELL = 0.2
-"""Metres."""
-SIDE = 90
-"""Cells of the map's sides; the start is in its middle."""
 RAYS, RAY_STEP = 256, 0.1
 """Directions in which sight is measured, and metres between the points along each."""
 UNKNOWN_COST = 1.3
@@ -40,48 +36,50 @@ class Ways:
     """float64 [N, cells]: direction in which it begins, straight to its first bend, in the frame of the start."""
     before: NDArray[np.int32]
     """int32 [N, cells]: the cell before each, itself where there is none."""
+    cells: WayCells
 
     def take(self, rows: slice) -> Ways:
         """Return some of the N places."""
-        return Ways(self.metres[rows], self.azimuths[rows], self.before[rows])
+        return Ways(self.metres[rows], self.azimuths[rows], self.before[rows], self.cells)
 
 
 class WayMap:
-    """Cells of 0.2 m within 9 m of the start, in its frame: rows along x, columns along y; flat arrays."""
+    """What is known of the floor in the cells of a way map."""
 
-    def __init__(self, grid: OccupancyGrid) -> None:
+    def __init__(self, grid: OccupancyGrid, cells: WayCells) -> None:
+        self.cells = cells
         blocked = find_blocked(grid)
-        standable, occupied, known = (_coarsen(grid, layer) for layer in (grid.standable, blocked, grid.known))
+        standable, occupied, known = (_coarsen(grid, layer, cells) for layer in (grid.standable, blocked, grid.known))
         self.open = standable.any(axis=-1)
-        """bool [side, side]: where the agent is known to fit."""
+        """bool [rows, columns]: where the agent is known to fit."""
         self.unknown = ~self.open & ~occupied.any(axis=-1) & ~known.all(axis=-1)
-        """bool [side, side]: what may be floor."""
+        """bool [rows, columns]: what may be floor."""
 
     def measure_ways(self, places: NDArray[np.float64]) -> Ways:
-        """Measure the ways from places [N, 2] to all cells."""
-        sources = to_cells(places)
+        """Measure the ways from places [N, 2], which lie on the map, to all cells."""
+        sources = self.cells.find(places)
         metres, before = csgraph.dijkstra(
             self._build_graph(sources), directed=True, indices=sources, return_predecessors=True
         )
-        own = np.arange(SIDE * SIDE, dtype=np.int32)
+        own = np.arange(self.cells.count, dtype=np.int32)
         before = np.where(before < 0, own, before)
-        away = get_centres() - places[:, None]
+        away = self.cells.centres - places[:, None]
         straight, azimuths = np.hypot(*np.moveaxis(away, -1, 0)), np.arctan2(away[..., 1], away[..., 0])
         visible = straight < self._measure_sight(places, azimuths) + CELL
         bend = np.where(visible, own, before)
         for _ in range(8):  # each doubles how far back along its way a cell looks for one in sight
             bend = np.take_along_axis(bend, bend, axis=1)
-        return Ways(metres * OCTILE, np.take_along_axis(azimuths, bend, axis=1), before)
+        return Ways(metres * OCTILE, np.take_along_axis(azimuths, bend, axis=1), before, self.cells)
 
     def _measure_sight(self, places: NDArray[np.float64], azimuths: NDArray[np.float64]) -> NDArray[np.float64]:
         """Return how far one could go straight ahead from places [N, 2] at azimuths [N, cells]: float64 [N, cells]."""
         angles = (np.arange(RAYS) + 0.5) * 2 * np.pi / RAYS - np.pi
-        steps = np.arange(CELL, SIDE * CELL / np.sqrt(2), RAY_STEP)
+        steps = np.arange(CELL, max(self.cells.shape) * CELL / np.sqrt(2), RAY_STEP)
         points = steps[:, None, None] * np.stack([np.cos(angles), np.sin(angles)], axis=1)
         free = (self.open | self.unknown).ravel()
         sight = np.empty(azimuths.shape)
         for row, place in enumerate(places):
-            blocked = ~free[to_cells((place + points).reshape(-1, 2))].reshape(len(steps), RAYS)
+            blocked = ~free[self.cells.find((place + points).reshape(-1, 2))].reshape(len(steps), RAYS)
             reach = np.where(blocked.any(axis=0), steps[blocked.argmax(axis=0)], np.inf)
             sight[row] = reach[((azimuths[row] + np.pi) / (2 * np.pi) * RAYS).astype(np.intp) % RAYS]
         return sight
@@ -98,11 +96,12 @@ class WayMap:
         passable: NDArray[np.bool_] = np.asarray(self.open | self.unknown)
         passable.ravel()[sources] = True
         cost = np.where(self.unknown, UNKNOWN_COST, 1.0)
-        index = np.arange(SIDE * SIDE, dtype=np.int32).reshape(SIDE, SIDE)
+        rows, columns = self.cells.shape
+        index = np.arange(self.cells.count, dtype=np.int32).reshape(rows, columns)
         heads, tails, lengths = [], [], []
         for dr, dc in ((0, 1), (1, 0), (1, 1), (1, -1)):
-            a = slice(0, SIDE - dr), slice(max(0, -dc), SIDE - max(0, dc))
-            b = slice(dr, SIDE), slice(max(0, dc), SIDE - max(0, -dc))
+            a = slice(0, rows - dr), slice(max(0, -dc), columns - max(0, dc))
+            b = slice(dr, rows), slice(max(0, dc), columns - max(0, -dc))
             free = passable[a] & passable[b]
             if dr and dc:  # no step between two cells that touch at a corner
                 free &= passable[a[0], b[1]] & passable[b[0], a[1]]
@@ -111,7 +110,7 @@ class WayMap:
             tails += [index[b][free], index[a][free]]
             lengths += [length, length]
         edges = np.concatenate(heads), np.concatenate(tails)
-        return sparse.csr_array((np.concatenate(lengths), edges), shape=(SIDE * SIDE, SIDE * SIDE))
+        return sparse.csr_array((np.concatenate(lengths), edges), shape=(self.cells.count, self.cells.count))
 
 
 def find_blocked(grid: OccupancyGrid) -> NDArray[np.bool_]:
@@ -129,46 +128,26 @@ def find_blocked(grid: OccupancyGrid) -> NDArray[np.bool_]:
     return blocked
 
 
-def _coarsen(grid: OccupancyGrid, layer: NDArray[np.bool_]) -> NDArray[np.bool_]:
-    """Return a layer's values in each cell of the way map: bool [side, side, 4]; False outside of the grid."""
+def _coarsen(grid: OccupancyGrid, layer: NDArray[np.bool_], cells: WayCells) -> NDArray[np.bool_]:
+    """Return a layer's values in each cell of the way map: bool [rows, columns, 4]; False outside of the grid."""
     factor = round(CELL / FINE)
-    fine = crop_layer(grid, layer, (-SIDE * factor // 2, -SIDE * factor // 2), SIDE * factor)
-    return fine.reshape(SIDE, factor, SIDE, factor).transpose(0, 2, 1, 3).reshape(SIDE, SIDE, -1)
+    rows, columns = cells.shape
+    first = cells.low[0] * factor, cells.low[1] * factor
+    fine = crop_layer(grid, layer, first, (rows * factor, columns * factor))
+    return fine.reshape(rows, factor, columns, factor).transpose(0, 2, 1, 3).reshape(rows, columns, -1)
 
 
-def crop_layer(grid: OccupancyGrid, layer: NDArray[np.bool_], first: tuple[int, int], side: int) -> NDArray[np.bool_]:
-    """Return a square of a grid's layer, bool [side, side], from row and column `first` on; False outside of the grid.
+def crop_layer(
+    grid: OccupancyGrid, layer: NDArray[np.bool_], first: tuple[int, int], shape: tuple[int, int]
+) -> NDArray[np.bool_]:
+    """Return a part of a grid's layer, bool of a shape, from row and column `first` on; False outside of the grid.
 
     Rows and columns are counted from the start's.
     """
-    cropped = np.zeros((side, side), bool)
+    cropped = np.zeros(shape, bool)
     shift = np.array(grid.origin) - first
-    low, high = np.maximum(shift, 0), np.minimum(shift + layer.shape, side)
+    low, high = np.maximum(shift, 0), np.minimum(shift + layer.shape, shape)
     if (low < high).all():
         own = tuple(slice(a - s, b - s) for a, b, s in zip(low, high, shift, strict=True))
         cropped[low[0] : high[0], low[1] : high[1]] = layer[own]
     return cropped
-
-
-def to_cells(points: NDArray[np.float64]) -> NDArray[np.intp]:
-    """Return the flat index of the cell that each of N points [N, 2] is in, or of the nearest one of the map."""
-    cells = np.clip(np.floor(np.asarray(points) / CELL).astype(np.intp) + SIDE // 2, 0, SIDE - 1)
-    return cells[:, 0] * SIDE + cells[:, 1]
-
-
-@cache
-def get_centres() -> NDArray[np.float64]:
-    """Return the middles of all cells in metres: float64 [cells, 2]."""
-    along = (np.arange(SIDE) - SIDE // 2 + 0.5) * CELL
-    return np.stack(np.meshgrid(along, along, indexing="ij"), axis=-1).reshape(-1, 2)
-
-
-def find_near(point: NDArray[np.float64], radius: float) -> NDArray[np.intp]:
-    """Return the cells whose middles are within `radius` metres of a point [2]."""
-    row, column = divmod(int(to_cells(point[None])[0]), SIDE)
-    reach = int(radius / CELL) + 1
-    rows = np.arange(max(0, row - reach), min(SIDE, row + reach + 1))
-    columns = np.arange(max(0, column - reach), min(SIDE, column + reach + 1))
-    cells = (rows[:, None] * SIDE + columns).ravel()
-    away = get_centres()[cells] - point
-    return cells[(away**2).sum(axis=1) < radius**2]

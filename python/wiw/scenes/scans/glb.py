@@ -104,9 +104,8 @@ class Glb:
         return list(self._placed_meshes())
 
     def _placed_meshes(self) -> Iterator[tuple[int, NDArray[np.float64]]]:
-        nodes, scenes = self.items("nodes"), self.items("scenes")
-        roots = scenes[self.document.get("scene", 0)]["nodes"] if scenes else range(len(nodes))
-        stack = [(index, np.eye(4)) for index in roots]
+        nodes = self.items("nodes")
+        stack = [(index, np.eye(4)) for index in self._list_roots()]
         seen = 0
         while stack:
             index, above = stack.pop()
@@ -118,6 +117,19 @@ class Glb:
             if "mesh" in node:
                 yield node["mesh"], here
             stack.extend((child, here) for child in node.get("children", []))
+
+    def _list_roots(self) -> list[int]:
+        """Return the nodes that the file's scene begins with; without scenes, those that are nobody's children.
+
+        What a file without scenes shows is left open by glTF; here every part counts once.
+        """
+        nodes, scenes = self.items("nodes"), self.items("scenes")
+        if scenes:
+            return list(scenes[self.document.get("scene", 0)].get("nodes", []))
+        children = {child for node in nodes for child in node.get("children", [])}
+        if nodes and len(children) >= len(nodes):
+            raise ValueError("its nodes form a circle")
+        return [index for index in range(len(nodes)) if index not in children]
 
 
 def _chunks(data: bytes, length: int) -> Iterator[tuple[int, bytes]]:

@@ -6,12 +6,13 @@ from __future__ import annotations
 import math
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Mapping
-from dataclasses import asdict, dataclass, fields
+from dataclasses import asdict, dataclass
 from pathlib import Path
-from typing import Any, Literal, TypeVar, get_args, get_origin, get_type_hints, overload
+from typing import Any, Literal, TypeVar, overload
 
 from wiw.errors import ArgumentError
 from wiw.mapping_files import read_yaml_mapping
+from wiw.typed_values import read_values
 
 FOLDER = Path(__file__).parents[2] / "configs" / "post-training"
 Schedule = Literal["constant", "linear", "cosine"]
@@ -180,52 +181,6 @@ def load_recipe(
     """
     values: dict[str, Any] = {}
     for path in (FOLDER / f"{name}.yaml", *([Path(file)] if file else [])):
-        values |= _check(read_yaml_mapping(path, "a recipe, `name: value` lines"), str(path), kind)
-    values |= _check(dict(options or {}), "recipe", kind)
+        values |= read_values(kind, read_yaml_mapping(path, "a recipe, `name: value` lines"), str(path))
+    values |= read_values(kind, options or {}, "recipe")
     return kind(**values)
-
-
-def _check(values: Mapping[str, Any], where: str, kind: type[ClipRecipe]) -> dict[str, Any]:
-    known = [field.name for field in fields(kind)]
-    kinds = get_type_hints(kind)
-    found: dict[str, Any] = {}
-    for name, given in values.items():
-        if name not in known:
-            raise ArgumentError(f"{where}: no recipe has '{name}'; expected {', '.join(known)}")
-        value = _parse_float(given) if kinds[name] is float else given
-        if not _fits(value, kinds[name]):
-            raise ArgumentError(f"{where}: {name}: expected {_describe(kinds[name])}, got {given!r}")
-        found[name] = value
-    return found
-
-
-def _parse_float(value: Any) -> Any:
-    """Return a number as a float, also one that YAML takes for text, such as 1e-5; anything else as it is."""
-    if isinstance(value, bool) or not isinstance(value, int | float | str):
-        return value
-    try:
-        return float(value)
-    except ValueError:
-        return value
-
-
-def _fits(value: Any, kind: Any) -> bool:
-    if kind in (int, float, bool):
-        allowed: Any = (int, float) if kind is float else kind
-        return isinstance(value, allowed) and (kind is bool or not isinstance(value, bool))
-    if kind == int | None:
-        return value is None or _fits(value, int)
-    if kind == tuple[int, int] | None:
-        return value is None or _fits(value, tuple[int, int])
-    if get_origin(kind) is tuple:
-        return isinstance(value, list | tuple) and all(_fits(each, int) for each in value)
-    return value in get_args(kind)
-
-
-def _describe(kind: Any) -> str:
-    names: dict[Any, str] = {int: "a whole number", float: "a number", bool: "true or false"}
-    names |= {int | None: "a whole number or null", tuple[int, int]: "[height, width]"}
-    names |= {tuple[int, int] | None: "[height, width] or null"}
-    if kind in names:
-        return names[kind]
-    return "a list of whole numbers" if get_origin(kind) is tuple else f"one of {', '.join(get_args(kind))}"
