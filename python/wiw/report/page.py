@@ -113,7 +113,7 @@ def render(run: Run, episodes: int | None = None, scale: float = 1.0, remark: st
             stories=shown,
             maps=maps,
             pictures=album.pictures,
-            costs=[(line, line.cells()[: len(paid)]) for line in ledger],
+            costs=[(line, line.cells(paid)) for line in ledger],
             cost_columns=paid,
             fidelity=[(line, line.cells(measured)) for line in truths],
             fidelity_columns=[(column.title, column.about) for column in measured],

@@ -440,6 +440,21 @@ class RunStore:
             found[row["arm"]][row["key"]] = float(row["total"] or 0)
         return found
 
+    def count_answers(self) -> dict[str, dict[str, int]]:
+        """Return by arm how many answers of a language model ended episodes have, by their problem's kind.
+
+        The kind is empty where an answer could be used. An arm that asked nothing is left out.
+        """
+        found: dict[str, dict[str, int]] = {}
+        problem = "json_extract(e.value, '$.problem')"
+        for row in self._rows(
+            f"SELECT arm, substr({problem}, 1, instr({problem} || ':', ':') - 1) AS trouble, count(*) AS n "
+            "FROM decision d JOIN outcome USING (arm, episode), json_each(d.exchanges) e "
+            "WHERE json_array_length(e.value, '$.said') > 0 GROUP BY arm, trouble ORDER BY arm, trouble"
+        ):
+            found.setdefault(row["arm"], {})[row["trouble"] or ""] = row["n"]
+        return found
+
     def sum_lost_costs(self) -> dict[str, dict[str, float]]:
         """Return by arm and name what was spent on decisions that an error interrupted."""
         found: dict[str, dict[str, float]] = {}
