@@ -1,6 +1,10 @@
 # SPDX-License-Identifier: Apache-2.0
 """Every error that `wiw` raises on purpose. Messages say what was expected, what was received, and what to do."""
 
+import sysconfig
+import traceback
+from pathlib import Path
+
 from wiw._core import ArgumentError, BackendError, Error, FileError, NavigationError
 
 __all__ = [
@@ -25,8 +29,14 @@ __all__ = [
     "TrainingError",
     "VlmError",
     "WeightsError",
+    "find_raising_line",
     "is_stop_request",
 ]
+
+OWN = str(Path(__file__).parent)
+"""Folder of wiw's code."""
+LIBRARIES = tuple(sysconfig.get_path(name) for name in ("stdlib", "platstdlib", "purelib", "platlib"))
+"""Folders of installed code."""
 
 
 for _error in (ArgumentError, BackendError, Error, FileError, NavigationError):
@@ -40,6 +50,17 @@ def is_stop_request(error: BaseException) -> bool:
     """
     own = type(error).__module__.partition(".")[0] == "wiw" and not isinstance(error, Exception)
     return own or isinstance(error, KeyboardInterrupt)
+
+
+def find_raising_line(error: BaseException) -> traceback.FrameSummary | None:
+    """Return the line of a user's code at which an exception was raised, or that led to it.
+
+    It is the last line outside wiw and installed packages, or else outside wiw; None where no other line was reached.
+    """
+    frames = traceback.extract_tb(error.__traceback__)
+    foreign = [frame for frame in frames if not frame.filename.startswith((OWN, "<"))]
+    users = [frame for frame in foreign if not frame.filename.startswith(LIBRARIES)]
+    return next(reversed(users or foreign), None)
 
 
 class EpisodesError(ArgumentError):

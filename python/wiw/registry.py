@@ -15,7 +15,6 @@ import importlib
 import importlib.util
 import inspect
 import sys
-import traceback
 from collections.abc import Callable
 from dataclasses import dataclass, field
 from functools import partial
@@ -25,7 +24,7 @@ from importlib.metadata import entry_points
 from pathlib import Path
 from typing import Any
 
-from wiw.errors import ConstructionError, Error, RegistryError, is_stop_request
+from wiw.errors import ConstructionError, Error, RegistryError, find_raising_line, is_stop_request
 from wiw.suggestions import did_you_mean
 
 
@@ -96,7 +95,11 @@ class Registry:
             return partial(self.find_here(prefix + colon), argument)
         if colon:
             return self._load(name, partial(_attribute, name))
-        hint = did_you_mean(name, self.names())
+        hint = (
+            f" A file defines several things: name one of its classes, as {name}:CLASS."
+            if name.endswith(".py")
+            else did_you_mean(name, self.names())
+        )
         raise RegistryError(
             f"no {self.kind} is named '{name}'.{hint} Known: {', '.join(self.names())}; "
             + "or give path.py:Class, package.module:Class"
@@ -219,10 +222,8 @@ def _import_file(path: Path) -> Any:
 
 def _locate_error(error: BaseException) -> str:
     """Return, e.g., " (model.py, line 3)": where an import failed, as the message alone may not say."""
-    if isinstance(error, SyntaxError | FileNotFoundError | AttributeError) or error.__traceback__ is None:
-        return ""
-    frame = traceback.extract_tb(error.__traceback__)[-1]
-    return f" ({Path(frame.filename).name}, line {frame.lineno})"
+    place = None if isinstance(error, SyntaxError | FileNotFoundError | AttributeError) else find_raising_line(error)
+    return "" if place is None else f" ({Path(place.filename).name}, line {place.lineno})"
 
 
 WORLD_MODELS = Registry(

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 import wiw
-from wiw.analysis.costs import Costs
+from wiw.analysis.costs import COLUMNS, LOST_COLUMNS, PRICE_COLUMN, Costs, cost_columns
 from wiw.cli.app import main
 from wiw.errors import ArgumentError
 from wiw.loop.attempts import TRIES
@@ -110,9 +110,17 @@ def test_what_failed_attempts_took_is_booked_apart(two_rooms, tmp_path, monkeypa
 def test_a_success_has_its_price() -> None:
     costs = Costs("warp", 4, 2.0, 20, {"rows": 60.0, "consultations": 20.0}, {"calls": 5.0}, {"world_model": 3.0})
     assert costs.as_dict()["rollouts_per_success"] == 30.0 and costs.as_dict()["seconds_per_success"] == 1.5
-    assert "15.0" in costs.cells() and "30.0" in costs.cells()
+    assert "15.0" in costs.cells(COLUMNS) and "30.0" in costs.cells(COLUMNS)
     none = Costs("none", 4, 0.0, 20, {}, {}, {"propose": 1.0})
-    assert math.isinf(none.per_success(1.0)) and none.cells()[-4:] == ["–", "∞", "0.0", "0.00"]
+    assert math.isinf(none.per_success(1.0)) and none.cells(COLUMNS)[-2:] == ["–", "∞"]
+    assert none.cells(LOST_COLUMNS) == ["0.0", "0.00"]
+
+
+def test_dollars_are_a_column_where_a_price_is_known() -> None:
+    free = Costs("none", 4, 2.0, 20, {}, {"vlm_tokens": 10.0}, {})
+    paid = Costs("warp", 4, 2.0, 20, {}, {"vlm_tokens": 10.0, "vlm_usd": 0.05}, {})
+    assert PRICE_COLUMN not in cost_columns([free]) and PRICE_COLUMN in cost_columns([free, paid])
+    assert [line.cells([PRICE_COLUMN]) for line in (free, paid)] == [["–"], ["0.0125"]]
 
 
 def test_tokens_of_a_policy_are_counted(two_rooms, tmp_path) -> None:

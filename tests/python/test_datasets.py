@@ -16,7 +16,7 @@ from wiw.datasets import episodes as files
 from wiw.datasets.cameras import camera_pose
 from wiw.datasets.habitat import heading_of, yaw_of
 from wiw.datasets.worlds import world
-from wiw.errors import FileError
+from wiw.errors import ArgumentError, FileError
 from wiw.runs.recipes import AgentRecipe, TaskRecipe
 from wiw.studies.evaluate import evaluate, resume_run
 from wiw.tasks.imagenav import ImageNav
@@ -279,3 +279,15 @@ def test_damaged_files_are_named(tmp_path: Path, content: bytes) -> None:
         files.load(path)
     with pytest.raises(FileError, match="nowhere"):
         files.load(tmp_path / "nowhere.json")
+
+
+@pytest.mark.parametrize("option", [{"scenes": "apartments:val"}, {"per_scene": 3}, {"tier": "far"}])
+def test_a_file_of_episodes_leaves_no_option_unused(option) -> None:
+    with pytest.raises(ArgumentError, match=f"{next(iter(option))}: this is for generated episodes"):
+        ImageNav(episode_file="episodes.json", **option)
+    assert ImageNav(**option).episode_file is None
+
+
+def test_a_folder_of_scenes_without_a_file_of_episodes_is_refused() -> None:
+    with pytest.raises(ArgumentError, match="scene_folder says where the scenes of an episode file are"):
+        ImageNav(scene_folder="scans")

@@ -3,6 +3,7 @@
 
 from __future__ import annotations
 
+import json
 import os
 import subprocess
 import sys
@@ -12,7 +13,7 @@ from pathlib import Path
 import pytest
 
 import wiw
-from wiw.errors import RegistryError
+from wiw.errors import ConstructionError, Error, RegistryError, find_raising_line
 from wiw.registry import POLICIES, TASKS, WORLD_MODELS, Registry
 
 MODEL = """
@@ -129,3 +130,21 @@ def test_task_ids_and_paths_keep_their_case(tmp_path: Path, two_rooms: str) -> N
     for name in ("ImageNav-v0", "imagenav", "ImageNav", f"{tmp_path / 'task.py'}:Mine"):
         assert wiw.make(name, scenes=two_rooms).task.scenes == two_rooms
     assert type(TASKS.make(f"{tmp_path / 'task.py'}:Mine")).__name__ == "Mine"
+
+
+def test_a_file_without_a_class_asks_for_one() -> None:
+    with pytest.raises(RegistryError, match=r"named 'mine\.py'\. A file .* as mine\.py:CLASS"):
+        wiw.world_model("mine.py")
+
+
+def test_an_error_is_placed_at_the_line_of_its_user(tmp_path: Path) -> None:
+    file = tmp_path / "mine.py"
+    file.write_text(MODEL + "\n    def __init__(self):\n        np.zeros(3).reshape(2)\n")
+    with pytest.raises(ConstructionError, match=r"ValueError: .* \(mine\.py, line 13\)"):
+        WORLD_MODELS.make_here(f"{file}:Mine")
+    with pytest.raises(ValueError) as raised:
+        json.loads("no")
+    assert find_raising_line(raised.value).filename == __file__
+    with pytest.raises(Error) as raised:
+        wiw.world_model("copy", size="small")
+    assert find_raising_line(raised.value).filename == __file__

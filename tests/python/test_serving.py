@@ -245,6 +245,7 @@ def test_a_row_that_the_model_cannot_do_fails_alone():
         (np.zeros((4, 6, 9, 16, 3), np.uint8), "shape"),
         (np.zeros((4, 7, *SIZE, 3), np.uint8), "frames"),
         (np.full((4, 6, *SIZE, 3), np.nan), "nan"),
+        (np.zeros((4, 6, *SIZE, 3)), "dtype"),
         ("frames", "type"),
     ],
 )
@@ -254,6 +255,7 @@ def test_a_broken_contract_is_named_as_at_home(answer, kind, monkeypatch):
         with pytest.raises(ContractError, match=r"Plain\.rollout: expected uint8") as caught:
             ask(client)
         assert caught.value.kind == kind
+        assert (".astype(numpy.uint8)" in str(caught.value)) == (kind == "dtype")
         with pytest.raises(RolloutError) as caught:
             Attempted(client, 20.0).rollout(make_conditioning(4), plans(4), np.arange(4, dtype=np.uint64))
         assert caught.value.kind == kind

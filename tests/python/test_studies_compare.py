@@ -1,5 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
 import io
+import shutil
 import sqlite3
 from dataclasses import dataclass, replace
 
@@ -12,6 +13,7 @@ from wiw.analysis.statistics import compute_p_value, estimate_difference
 from wiw.cli import main
 from wiw.errors import ArgumentError, StoreError
 from wiw.metrics.metric import SUCCESS
+from wiw.runs.store import store_path
 from wiw.studies.evaluate import run_arms
 from wiw.studies.run_log import load_run
 
@@ -50,6 +52,17 @@ def test_common_arms_are_paired_by_episode(runs):
 def test_it_says_what_differs_between_the_agents(runs):
     remarks = wiw.compare(*runs).remarks()
     assert remarks[0] == "copy: same agent in both runs." and remarks[2] == "warp: drive 0.4 -> 0.8."
+
+
+def test_an_arm_that_was_not_begun_is_compared_as_it_was_configured(runs, tmp_path):
+    stopped = tmp_path / "stopped"
+    shutil.copytree(runs[0], stopped)
+    with sqlite3.connect(store_path(stopped)) as store:
+        store.execute("DELETE FROM decision WHERE arm = 'warp'")
+        store.execute("DELETE FROM outcome WHERE arm = 'warp'")
+        store.execute("UPDATE run SET info = json_remove(info, '$.built.warp')")
+    assert "warp: same agent in both runs." in wiw.compare(runs[0], stopped).remarks()
+    assert "warp: drive 0.4 -> 0.8." in wiw.compare(stopped, runs[1]).remarks()
 
 
 def test_arms_of_two_names(runs):

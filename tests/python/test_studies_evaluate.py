@@ -179,7 +179,7 @@ def test_an_existing_run_is_continued_only_on_request(reference, tmp_path):
     with pytest.raises(StoreError, match="holds a run already"):
         run(tmp_path / "run")
     assert facts(run(tmp_path / "run", resume=True)) == facts(first) == facts(reference)
-    with pytest.raises(StoreError, match="another configuration"):
+    with pytest.raises(StoreError, match=r"another configuration \(arms\.\w+\.drive: the run has [0-9.]+, now 0\.9\)"):
         run(tmp_path / "run", resume=True, agent=LineAgent(0.9))
     with pytest.raises(StoreError, match="resume=True"):
         resume_run(tmp_path / "run")

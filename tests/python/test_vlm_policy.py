@@ -259,6 +259,19 @@ def test_all_categories_are_one_question_or_rounds(tmp_path: Path, two_rooms: st
         assert [len(call.labels) for call in client.calls if len(call.labels) > 3] == asked
 
 
+def test_a_summary_says_how_many_answers_could_not_be_used(two_rooms: str, tmp_path: Path) -> None:
+    def run(name: str, *answers: str) -> Any:
+        said = iter(answers)
+        policy = VLM(MockClient(lambda call: next(said)), tries=1)
+        task = wiw.make("ImageNav-v0", scenes=two_rooms, decisions=2)
+        return evaluate(task, wiw.Agent(policy), 1, out=tmp_path / name, progress=False).numbers()
+
+    half = run("half", WALK, "I'm sorry, no.")
+    assert half.answers == {"none": {"": 1, "refusal": 1}}
+    assert "none: 1 of 2 answers of its language model (50 %) could not be used (refusal 1)." in str(half.remarks())
+    assert not run("whole", WALK, WALK).remarks()
+
+
 def test_a_primitive_that_no_plan_begins_with_is_a_plan_of_its_own(recognition: Any) -> None:
     client = MockClient(
         lambda call: {letter_of(call, "turn right by 22.5 degrees"): 1.0} if len(call.labels) == 3 else script(call)

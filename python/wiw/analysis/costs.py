@@ -24,6 +24,8 @@ COLUMNS = (
     ("s / success", "Seconds of the arm divided by its successes."),
 )
 """Columns of the table and their meaning."""
+PRICE_COLUMN = ("$", "Dollars per episode for a language model, of those whose prices are known (--vlm-prices).")
+"""Further column, where any price is known."""
 LOST_COLUMNS = (
     ("lost calls", "Calls per episode for decisions that were interrupted by an error; in no other column."),
     ("lost s", "Seconds per episode on them."),
@@ -43,7 +45,8 @@ class Costs:
     calls: Mapping[str, float]
     """Requested: consultations, rows (rollouts), frames. A function of the decisions alone."""
     spent: Mapping[str, float]
-    """Spent: calls of the model with their rows and frames, retries, cached_rows, vlm_tokens, credits of a service."""
+    """Spent: calls of the model with their rows and frames, retries, cached_rows, vlm_tokens and vlm_usd, credits of a
+    service."""
     seconds: Mapping[str, float]
     """Wall time by stage; it depends on the machine and on what else ran."""
     lost: Mapping[str, float] = field(default_factory=dict)
@@ -74,26 +77,28 @@ class Costs:
             "seconds_per_success": self.per_success(self.all_seconds),
         }
 
-    def cells(self) -> list[str]:
-        """Return the cells of the table, with those of `LOST_COLUMNS`."""
+    def cells(self, columns: Sequence[tuple[str, str]]) -> list[str]:
+        """Return the cells of these columns, such as `cost_columns` chooses."""
         each = max(1, self.episodes)
         asked, spent = self.calls, self.spent
         rows = asked.get("rows", 0.0)
-        return [
-            f"{self.decisions / each:.1f}",
-            f"{asked.get('consultations', 0.0) / each:.1f}",
-            f"{rows / each:.1f}",
-            f"{asked.get('frames', 0.0) / each:.1f}",
-            f"{spent.get('calls', 0.0) / each:.1f}",
-            f"{100 * spent.get('cached_rows', 0.0) / rows:.0f} %" if rows else "–",
-            f"{tokens / each:.0f}" if (tokens := spent.get("vlm_tokens", 0.0)) else "–",
-            f"{self.seconds.get('world_model', 0.0) / each:.2f}",
-            f"{self.all_seconds / each:.2f}",
-            _number(self.per_success(rows)) if rows else "–",
-            _number(self.per_success(self.all_seconds)),
-            f"{self.lost.get('calls', 0.0) / each:.1f}",
-            f"{self.lost.get('seconds', 0.0) / each:.2f}",
-        ]
+        found = {
+            "decisions": f"{self.decisions / each:.1f}",
+            "consulted": f"{asked.get('consultations', 0.0) / each:.1f}",
+            "rollouts": f"{rows / each:.1f}",
+            "frames": f"{asked.get('frames', 0.0) / each:.1f}",
+            "calls": f"{spent.get('calls', 0.0) / each:.1f}",
+            "cached": f"{100 * spent.get('cached_rows', 0.0) / rows:.0f} %" if rows else "–",
+            "tokens": f"{tokens / each:.0f}" if (tokens := spent.get("vlm_tokens", 0.0)) else "–",
+            "$": f"{spent['vlm_usd'] / each:.4f}" if "vlm_usd" in spent else "–",
+            "model s": f"{self.seconds.get('world_model', 0.0) / each:.2f}",
+            "all s": f"{self.all_seconds / each:.2f}",
+            "rollouts / success": _number(self.per_success(rows)) if rows else "–",
+            "s / success": _number(self.per_success(self.all_seconds)),
+            "lost calls": f"{self.lost.get('calls', 0.0) / each:.1f}",
+            "lost s": f"{self.lost.get('seconds', 0.0) / each:.2f}",
+        }
+        return [found[title] for title, _ in columns]
 
 
 def costs(run: Run) -> list[Costs]:
@@ -119,7 +124,8 @@ def costs(run: Run) -> list[Costs]:
 
 def cost_columns(lines: Sequence[Costs]) -> tuple[tuple[str, str], ...]:
     """Return the columns that these arms need."""
-    return COLUMNS + LOST_COLUMNS if any(line.lost for line in lines) else COLUMNS
+    priced = (PRICE_COLUMN,) if any("vlm_usd" in line.spent for line in lines) else ()
+    return COLUMNS + priced + (LOST_COLUMNS if any(line.lost for line in lines) else ())
 
 
 def _number(value: float) -> str:

@@ -134,6 +134,8 @@ class Summary:
     """Episodes whose question is asked in one scene only, so that its text may give the answer away."""
     trackers: Mapping[str, str] = field(default_factory=dict, kw_only=True)
     """Trackers of targets in imagined frames by name, each with "frames" or "poses", whichever it followed."""
+    answers: Mapping[str, Mapping[str, int]] = field(default_factory=dict, kw_only=True)
+    """Answers of a language model by arm and by the kind of problem for which they could not be used ("": none)."""
     looks: str = field(default="", kw_only=True)
     """Sentences on the rule by which the run was to stop early, and on whether it did; empty without one."""
     noise: tuple[NoiseFloor, ...] = field(default=(), kw_only=True)
@@ -181,6 +183,7 @@ class Summary:
             for name, follows in self.trackers.items()
             if follows in TRACKED
         ]
+        found += [_describe_unusable(arm, kinds) for arm, kinds in self.answers.items() if any(kinds)]
         if self.unbalanced:
             found.append(
                 f"Unbalanced questions in {self.unbalanced} of the episodes: each is asked in one scene only, so its "
@@ -285,10 +288,12 @@ def summarise_run(run: Run) -> Summary:
         anytime="until" in run.store.info,
     )
     tiers = _summarise_tiers(run, outcomes, policies)
+    answers = run.store.count_answers()
     return replace(
         found,
         unbalanced=count_unbalanced(run),
         trackers=_list_trackers(run),
+        answers={arm: answers[arm] for arm in run.arms if arm in answers},
         departures=read_departures(run.store.info),
         looks=_describe_looks(run.store.info),
         noise=measure_noise(run.store.config["arms"], split_outcomes(run.arms, outcomes)[0], run.store.config["seed"]),
@@ -306,6 +311,17 @@ def _describe_noise(noise: NoiseFloor) -> str:
         f"{said} differs from itself in {differing} of {found.estimate.n} episodes ({found.wins} won, {found.losses} "
         f"lost), SR by {show_estimate(found.estimate, signed=True)} points. A difference between arms that is no "
         "larger may be due to this alone."
+    )
+
+
+def _describe_unusable(arm: str, kinds: Mapping[str, int]) -> str:
+    """Return how many answers of a language model could not be used, and why."""
+    problems = {kind: count for kind, count in kinds.items() if kind}
+    unusable, asked = sum(problems.values()), sum(kinds.values())
+    reasons = ", ".join(f"{kind} {count}" for kind, count in sorted(problems.items(), key=lambda each: -each[1]))
+    return (
+        f"{arm}: {unusable} of {asked} answers of its language model ({100 * unusable / asked:.0f} %) could not be "
+        f"used ({reasons}). What stood in for them, such as a primitive that was drawn, is scored."
     )
 
 

@@ -126,7 +126,8 @@ def _load(name: str, backend: Any) -> Any:
 def _list_facts(place: Any) -> list[str]:
     from wiw.viz.contact_sheet import short_name
 
-    scene, navmesh = place.scene, place.navmesh
+    scene = place.scene
+    floors = [island for index, island in enumerate(place.navmesh.islands) if index not in place.roofs]
     width, height, depth = scene.bounds[1] - scene.bounds[0]
     return [
         short_name(place.name),
@@ -135,6 +136,6 @@ def _list_facts(place: Any) -> list[str]:
         str(len(scene.instances)),
         str(len(scene.categories)),
         str(len(scene.rooms)) if scene.rooms else "?",
-        f"{navmesh.area:.0f}",
-        str(len(navmesh.islands)),
+        f"{sum(island.area for island in floors):.0f}",
+        str(len(floors)),
     ]

@@ -210,7 +210,7 @@ def generate(
     """
     key = core.fold_key([seed, first, 0xA12])
     things = _targets(world, categories)
-    points = world.ground.put_down(world.navmesh.sample(rules.survey, key)).astype(np.float64)
+    points = world.ground.put_down(world.navmesh.sample(rules.survey, key, world.floor)).astype(np.float64)
     survey = Survey(points, measure_sizes(world, points, COARSE))
     made: list[Episode] = []
     tally = Counter(before)

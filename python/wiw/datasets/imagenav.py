@@ -31,6 +31,8 @@ _LENGTH, _BUDGET, _IN_SIGHT, _DULL_GOAL = (
 )
 RULES = (_LENGTH, _BUDGET, _IN_SIGHT, _DULL_GOAL, SEEN_AROUND, NO_FORK, TWO_CORNERS)
 """Rules, in the order in which they are checked."""
+NUMBERS = ("shortest", "longest", "budget", "goal_depth", "goal_instances")
+"""Rules that are numbers a place is held to."""
 ATTEMPTS = 10
 """Factor on the pairs tried per episode of a tier, since lengths are drawn from a part of the tier's range."""
 
@@ -136,7 +138,7 @@ def _fit_rules(world: World, rules: EpisodeRules) -> EpisodeRules:
 def _episode(world: World, index: int, seed: int, rules: EpisodeRules, tier: str = "") -> Episode:
     """Return an episode that satisfies `rules`, and what its tier asks beside a length."""
     key = core.fold_key([seed, index, 0x1A6E])
-    points = world.ground.put_down(world.navmesh.sample(2 * rules.attempts, key))
+    points = world.ground.put_down(world.navmesh.sample(2 * rules.attempts, key, world.floor))
     draws = core.uniform(core.fold_key([key, 1]), 5 * rules.attempts).reshape(-1, 5)
     broken: Counter[str] = Counter()
     for start, goal, draw in zip(points[::2], points[1::2], draws, strict=True):
@@ -178,14 +180,17 @@ def _explain_failure(world: World, rules: EpisodeRules, tier: str, broken: Count
     rule = next(each for each in reversed(RULES) if each in broken)
     reasons = ", ".join(f"{count} broke {each}" for each, count in broken.most_common())
     asked = f"episodes of tier '{tier}', " if tier else ""
+    given = rules.attempts // ATTEMPTS if tier else rules.attempts
+    more = f"more attempts (--task-option attempts={10 * given})"
     loosen = (
-        "Choose a larger scene, another tier, or more attempts (--task-option attempts=2000)"
+        f"Choose a larger scene, another tier, or {more}"
         if tier
-        else "Loosen one (--task-option goal_depth=0.8, or goal_depth=0.8 in Python), or raise attempts"
+        else f"Loosen one (--task-option goal_depth=0.8, or goal_depth=0.8 in Python), or give {more}"
     )
+    numbers = ", ".join(f"{name}={getattr(rules, name):g}" for name in NUMBERS)
     return EpisodesError(
-        f"{world.name}: {asked}no start and goal among {rules.attempts} satisfy {rules}: {reasons}. What got furthest "
-        f"broke {rule}. {loosen}",
+        f"{world.name}: {asked}no start and goal among {rules.attempts} satisfy {numbers}: {reasons}. What got "
+        f"furthest broke {rule}. {loosen}",
         rule,
     )
 

@@ -5,9 +5,11 @@ from __future__ import annotations
 
 from collections import OrderedDict
 from dataclasses import dataclass
+from functools import cached_property
 from pathlib import Path
 from typing import Literal
 
+from wiw.datasets.roofs import find_roofs
 from wiw.errors import FileError
 from wiw.nav import Ground, NavMesh
 from wiw.render import Renderer
@@ -33,6 +35,16 @@ class World:
     """Heights of the floor; the mesh lies up to 0.2 m above it."""
     backend: Literal["auto", "cpu", "gpu"] = "auto"
     """As the renderer was asked for."""
+
+    @cached_property
+    def roofs(self) -> frozenset[int]:
+        """Islands of the navigation mesh that are roofs."""
+        return find_roofs(self.navmesh, self.renderer)
+
+    @cached_property
+    def floor(self) -> int:
+        """The largest island of the navigation mesh that is no roof: where episodes take place."""
+        return next((index for index in range(len(self.navmesh.islands)) if index not in self.roofs), 0)
 
 
 _worlds: OrderedDict[tuple[str, str, Path | None], World] = OrderedDict()

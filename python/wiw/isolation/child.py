@@ -10,7 +10,6 @@ import pickle
 import signal
 import socket
 import sys
-import traceback
 import weakref
 from contextlib import suppress
 from pathlib import Path
@@ -115,8 +114,8 @@ def _call(host: Host, body: bytes, arrays: list[NDArray[np.uint8]]) -> dict[str,
 def describe_exception(error: BaseException) -> str:
     """Return the type, the text and the place of an exception, e.g. "ValueError: no (model.py, line 3)"."""
     text = " ".join(str(error).split())
-    frames = [frame for frame in traceback.extract_tb(error.__traceback__) if frame.filename != __file__]
-    where = f" ({Path(frames[-1].filename).name}, line {frames[-1].lineno})" if frames else ""
+    place = errors.find_raising_line(error)
+    where = "" if place is None else f" ({Path(place.filename).name}, line {place.lineno})"
     return f"{type(error).__name__}: {text}{where}"
 
 

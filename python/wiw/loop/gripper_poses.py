@@ -38,7 +38,10 @@ class GripperPoses(PlanSpace):
         accepts, name = model.accepts, type(model.unwrapped).__name__
         check_plan_space(model, GRIPPER_POSES, self.words)
         if accepts.control not in ("image", "text", "action"):
-            raise ArgumentError(f"{name} follows a {accepts.control} of the camera, but poses of a gripper move none")
+            raise ArgumentError(
+                f"{name} follows a {accepts.control} of the camera, but poses of a gripper move none; declare "
+                "control='action' to be given the poses, or 'text' or 'image'"
+            )
         if accepts.view != "perspective":
             raise ArgumentError(f"{name} imagines panoramas, but what a gripper does is seen in a front view")
         if "semantic" in accepts.needs:

@@ -116,7 +116,7 @@ def _gather_findings(run: Run) -> dict[str, Any]:
         "tiers": [{**tier, "sentence": sentence(tier["summary"], words)} for tier in _list_tiers(summary)],
         "terms": explain_metrics(summary, words),
         "plots": _draw_plots(run, summary, truths, blamed),
-        "costs": [(line, line.cells()[: len(paid)]) for line in ledger],
+        "costs": [(line, line.cells(paid)) for line in ledger],
         "cost_columns": paid,
         "fidelity": [(line, line.cells(measured)) for line in truths],
         "fidelity_columns": [(column.title, column.about) for column in measured],

@@ -92,8 +92,9 @@ def as_text(summary: SummaryTable) -> str:
 def print_costs(run: Run) -> None:
     """Print what each arm cost per episode; nothing where no episode has ended."""
     lines = costs(run)
-    titles = [title for title, _ in cost_columns(lines)]
-    print_stacked("Costs per episode", [line.arm for line in lines], titles, [line.cells() for line in lines])
+    columns = cost_columns(lines)
+    titles, cells = [title for title, _ in columns], [line.cells(columns) for line in lines]
+    print_stacked("Costs per episode", [line.arm for line in lines], titles, cells)
 
 
 def print_fidelity(run: Run) -> None:

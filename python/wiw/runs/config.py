@@ -91,6 +91,10 @@ class RunConfig(Limits, EngineConfig):
                 raise ArgumentError(f"evaluate: expected {name} of at least 0, got {getattr(self, name)}")
         if self.engine != "ray" and self.vlm_servers:
             raise ArgumentError("evaluate: vlm_servers are for engine ray: give --engine ray (engine=)")
+        if self.fidelity_share != RunConfig.fidelity_share and not self.measures_fidelity:
+            raise ArgumentError("evaluate: fidelity_share needs something to measure: give --fidelity (fidelity=True)")
+        if self.look_every != RunConfig.look_every and self.until is None:
+            raise ArgumentError("evaluate: look_every is between looks of a rule: give --until (until=)")
         if self.shard is not None:
             Shard.parse(self.shard)
         if self.until is not None and self.episodes is None:

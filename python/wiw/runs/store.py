@@ -451,6 +451,21 @@ class RunStore:
             found[row["arm"]][row["key"]] = float(row["total"] or 0)
         return found
 
+    def count_answers(self) -> dict[str, dict[str, int]]:
+        """Return by arm how many answers of a language model ended episodes have, by their problem's kind.
+
+        The kind is empty where an answer could be used. An arm that asked nothing is left out.
+        """
+        found: dict[str, dict[str, int]] = {}
+        problem = "json_extract(e.value, '$.problem')"
+        for row in self._rows(
+            f"SELECT arm, substr({problem}, 1, instr({problem} || ':', ':') - 1) AS trouble, count(*) AS n "
+            "FROM decision d JOIN outcome USING (arm, episode), json_each(d.exchanges) e "
+            "WHERE json_array_length(e.value, '$.said') > 0 GROUP BY arm, trouble ORDER BY arm, trouble"
+        ):
+            found.setdefault(row["arm"], {})[row["trouble"] or ""] = row["n"]
+        return found
+
     def sum_lost_costs(self) -> dict[str, dict[str, float]]:
         """Return by arm and name what was spent on decisions that an error interrupted."""
         found: dict[str, dict[str, float]] = {}
@@ -945,13 +960,33 @@ def _drop_new_arms(stored: dict[str, Any], wanted: dict[str, Any]) -> dict[str, 
     return {**wanted, "arms": [arms[arm["name"]] for arm in stored["arms"] if arm["name"] in arms]}
 
 
+def _list_differences(stored: dict[str, Any], wanted: dict[str, Any], prefix: str = "") -> list[str]:
+    """Return where two configurations differ, by dotted names; of arms with unlike names the names alone."""
+    found = []
+    for name in sorted(stored.keys() | wanted.keys()):
+        values = [_by_name(each.get(name)) for each in (stored, wanted)]
+        if values[0] == values[1]:
+            continue
+        both = isinstance(values[0], dict) and isinstance(values[1], dict)
+        if both and (name != "arms" or values[0].keys() == values[1].keys()):
+            found += _list_differences(values[0], values[1], f"{prefix}{name}.")
+        else:
+            shown = [", ".join(value) if both else to_json(value) for value in values]
+            found.append(f"{prefix}{name}: the run has {shown[0]}, now {shown[1]}")
+    return found
+
+
+def _by_name(value: Any) -> Any:
+    """Return the descriptions of arms by their names, and anything else as it is."""
+    items = value if isinstance(value, list) else []
+    is_arms = all(isinstance(item, dict) and item.keys() == {"name", "agent"} for item in items)
+    return {item["name"]: item["agent"] for item in items} if items and is_arms else value
+
+
 def _require_same(path: Path, stored: dict[str, Any], wanted: dict[str, Any]) -> None:
     if stored == wanted:
         return
-    differing = sorted(name for name in stored.keys() | wanted.keys() if stored.get(name) != wanted.get(name))
-    detail = "; ".join(
-        f"{name}: the run has {to_json(stored.get(name))}, now {to_json(wanted.get(name))}" for name in differing
-    )
+    detail = "; ".join(_list_differences(stored, wanted))
     raise StoreError(
         f"{path} is a run of another configuration ({detail}); resume it as it was begun or give another folder"
     )

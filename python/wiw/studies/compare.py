@@ -303,7 +303,9 @@ def _label(theirs: str, ours: str) -> str:
 
 def _describe_changes(a: RunLog, b: RunLog, pair: tuple[str, str]) -> list[str]:
     """Return how the two agents differ, by their descriptions and their version of wiw."""
-    described = [_describe_agent(log, arm) for log, arm in zip((a, b), pair, strict=True)]
+    sides = list(zip((a, b), pair, strict=True))
+    built = all(arm in log.store.info.get("built", {}) for log, arm in sides)
+    described = [_describe_agent(log, arm, built) for log, arm in sides]
     names = dict.fromkeys([*described[0], *described[1]])
     differing = [name for name in names if described[0].get(name) != described[1].get(name)]
     label = _label(pair[1], pair[0])
@@ -314,10 +316,10 @@ def _describe_changes(a: RunLog, b: RunLog, pair: tuple[str, str]) -> list[str]:
     return [f"{label}: {', '.join(details[:MOST_NAMED])}{more}."]
 
 
-def _describe_agent(log: RunLog, arm: str) -> dict[str, Any]:
-    """Return the agent's description as it was built, flattened; before that, as it was configured."""
+def _describe_agent(log: RunLog, arm: str, built: bool) -> dict[str, Any]:
+    """Return the agent's description, flattened: as it was built, or else as it was configured."""
     configured = next(one["agent"] for one in log.store.config["arms"] if one["name"] == arm)
-    return {**_flatten(log.store.info.get("built", {}).get(arm, configured)), "wiw": log.store.wiw_version}
+    return {**_flatten(log.store.info["built"][arm] if built else configured), "wiw": log.store.wiw_version}
 
 
 def _flatten(value: Mapping[str, Any], prefix: str = "") -> dict[str, Any]:

@@ -4,9 +4,7 @@
 from __future__ import annotations
 
 import json
-import sysconfig
 import time
-import traceback
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from itertools import combinations
@@ -18,7 +16,7 @@ from numpy.typing import NDArray
 
 from wiw import action
 from wiw.action import FORWARD, TURN_LEFT, TURN_RIGHT
-from wiw.errors import ArgumentError, ConstructionError, ContractError
+from wiw.errors import ArgumentError, ConstructionError, ContractError, find_raising_line
 from wiw.isolation.failures import EndedError, ExitError, LateError, RaisedError
 from wiw.loop.attempts import DEADLINE, make_model
 from wiw.loop.history import Frame, stack_histories
@@ -67,8 +65,6 @@ RUNS: Mapping[str, tuple[str, int]] = {
     GRIPPER_POSES: ("200 episodes of manipulation", 200 * 3 * 5),
 }
 """The paper's, in words, and the rows that it asks for: episodes, decisions and plans, roughly."""
-LIBRARIES = (str(Path(__file__).parents[1]), *(sysconfig.get_path(name) for name in ("stdlib", "purelib", "platlib")))
-"""Folders of code that is nobody's own model."""
 LONG_RUN = 24.0
 """Hours from which such a run is called slow."""
 
@@ -525,6 +521,6 @@ def _count_rows(off: NDArray[np.int16]) -> str:
 
 def _locate(error: BaseException) -> str:
     """Return the exception and its place: the last line outside libraries, which is the model's own."""
-    frames = traceback.extract_tb(error.__traceback__)
-    place = ([frame for frame in frames if not frame.filename.startswith(LIBRARIES)] or frames)[-1]
-    return f"{type(error).__name__}: {error} ({Path(place.filename).name}, line {place.lineno}: {place.line})"
+    place = find_raising_line(error)
+    where = "" if place is None else f" ({Path(place.filename).name}, line {place.lineno}: {place.line})"
+    return f"{type(error).__name__}: {error}{where}"

@@ -21,21 +21,26 @@ from wiw.tasks.base import Task
 from wiw.typed_values import require_known
 from wiw.types import Episode, check_seed
 
+DEFAULT_SCENES, DEFAULT_PER_SCENE = "apartments:val", 5
+
 
 class NavigationTask(NavigationSpec, Task):
     """Base of the tasks in which an agent walks; a subclass says what its goal is and when it is reached.
 
     Args:
-        scenes: scene spec, e.g. "apartments:val", "apartments:test:40", or the path of a mesh or SDF world; where
+        scenes: scene spec, e.g. "apartments:test:40", or the path of a mesh or SDF world; None: "apartments:val". Where
             Habitat's navigation mesh lies beside it ("house.navmesh" for "house.glb"), that one is used.
         seed: seed of the generated episodes and of the run.
         preset: "default", "paper", "official", or the path of a YAML file; `rules` overrides it field by field.
         episode_file: a JSON episode file to use instead of generating; habitat-lab's and World-in-World's are read too.
         scene_folder: folder that scene paths in an episode file are relative to; if not given, the folder of a file of
             wiw, else the present one.
-        per_scene: generated episodes a scene; of each tier, where there are several.
+        per_scene: generated episodes a scene, 5 (None); of each tier, where there are several.
         backend: renderer, "auto", "cpu" or "gpu".
         rules: rules of the task, and of the generator (`generator_class`).
+
+    Raises:
+        ArgumentError: rules that are not known, or options that an episode file leaves no use for.
     """
 
     rules_class: type
@@ -45,12 +50,12 @@ class NavigationTask(NavigationSpec, Task):
 
     def __init__(
         self,
-        scenes: str | Path = "apartments:val",
+        scenes: str | Path | None = None,
         seed: int = 0,
         preset: str | Path = presets.DEFAULT,
         episode_file: str | Path | None = None,
         scene_folder: str | Path = "",
-        per_scene: int = 5,
+        per_scene: int | None = None,
         backend: Literal["auto", "cpu", "gpu"] = "auto",
         **rules: Any,
     ) -> None:
@@ -63,13 +68,28 @@ class NavigationTask(NavigationSpec, Task):
         self.preset = presets.make_absolute(preset)
         self.preset_settings = presets.load_preset(owner, preset)
         given = {name: value for name, value in rules.items() if name not in own}
+        self._require_use({"scenes": scenes, "per_scene": per_scene, **given}, episode_file, scene_folder)
         self._generator_rules = {**self.preset_settings.generator, **given}
         self.generator: Any = presets.load_rules(self.generator_class, "", presets.DEFAULT, self._generator_rules)
-        self.scenes, self.seed = absolute(scenes), check_seed(seed)
-        self.backend, self.per_scene = backend, per_scene
+        self.scenes, self.seed = absolute(DEFAULT_SCENES if scenes is None else scenes), check_seed(seed)
+        self.backend, self.per_scene = backend, DEFAULT_PER_SCENE if per_scene is None else per_scene
         self.episode_file = None if episode_file is None else str(Path(episode_file).expanduser().absolute())
         self.scene_folder = str(Path(scene_folder).expanduser().absolute()) if scene_folder else ""
         self._episodes: list[Episode] = []
+
+    def _require_use(self, generating: Mapping[str, Any], file: str | Path | None, folder: str | Path) -> None:
+        """Refuse options of generated episodes beside a file of episodes, and the folder of its scenes without one."""
+        idle = [name for name, value in generating.items() if value is not None]
+        if file is not None and idle:
+            raise ArgumentError(
+                f"{self.name}: {', '.join(idle)}: this is for generated episodes, and those of {file} are run as they "
+                "are; leave it out, or the episode file"
+            )
+        if file is None and folder:
+            raise ArgumentError(
+                f"{self.name}: scene_folder says where the scenes of an episode file are; give episode_file too, or "
+                "name the scenes (scenes=...)"
+            )
 
     # -- what a task says of itself, besides `NavigationSpec` ----------------------------------------------------------
 

@@ -195,7 +195,8 @@ class SceneJob:
         """Record the pass; return what is known about it, or an "error" where the scene cannot be opened."""
         try:
             place = world(self.spec, self.options.backend)
-            traversals = plan_scene(place.navmesh, self.scene, self.options.seed, self.pass_index, self.options.rules)
+            rules, roofs = self.options.rules, place.roofs
+            traversals = plan_scene(place.navmesh, self.scene, self.options.seed, self.pass_index, rules, roofs)
         except BackendError:
             raise
         except Error as error:

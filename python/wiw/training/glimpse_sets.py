@@ -120,7 +120,7 @@ def collect_glimpse_sets(
     numbers = {name: i for i, name in enumerate(categories)}
     labels = np.array([-1, *(numbers.get(category_of(thing), -1) for thing in world.scene.instances)])
     key = core.fold_key([seed, 0x4C00])
-    points = world.ground.put_down(world.navmesh.sample(rules.survey, key)).astype(np.float64)
+    points = world.ground.put_down(world.navmesh.sample(rules.survey, key, world.floor)).astype(np.float64)
     sizes = np.where(labels >= 0, measure_sizes(world, points, COARSE), 0.0)
     tally: Counter[int] = Counter()
     parts: list[GlimpseSets] = []

@@ -79,7 +79,7 @@ def record_goal_places(world: World, seed: int, rules: PlaceRules = PlaceRules()
 
 def _choose_points(world: World, key: int, rules: PlaceRules) -> NDArray[np.float64]:
     """Choose places all over the scene, and places near each: float64 [N, 3] on the floor that is drawn."""
-    anchors = world.navmesh.sample(rules.anchors, key).astype(np.float64)
+    anchors = world.navmesh.sample(rules.anchors, key, world.floor).astype(np.float64)
     draws = core.uniform(core.fold_key([key, 1]), 2 * len(anchors) * TRIES).reshape(len(anchors), TRIES, 2)
     radius, angle = rules.reach * np.sqrt(draws[..., 0]), 2 * np.pi * draws[..., 1]
     offsets = np.stack([radius * np.cos(angle), np.zeros_like(radius), radius * np.sin(angle)], axis=-1)

@@ -174,10 +174,10 @@ def record_views(world: World, seed: int, rules: ViewRules = ViewRules()) -> Lab
 
 def _sample_places(world: World, rules: ViewRules, key: int) -> NDArray[np.float32]:
     """Return places where an agent can stand, float32 [N, 3]: anywhere, and close to things."""
-    candidates = world.navmesh.sample(CANDIDATES, core.fold_key([key, 3]))
+    candidates = world.navmesh.sample(CANDIDATES, core.fold_key([key, 3]), world.floor)
     count = round(rules.close * rules.places)
     close = _choose_close_places(candidates, world.scene.instances, count, core.fold_key([key, 4]))
-    return np.concatenate([world.navmesh.sample(rules.places - len(close), key), candidates[close]])
+    return np.concatenate([world.navmesh.sample(rules.places - len(close), key, world.floor), candidates[close]])
 
 
 def _choose_close_places(

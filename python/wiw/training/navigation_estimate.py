@@ -5,7 +5,7 @@ from __future__ import annotations
 
 import math
 import time
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Collection, Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -85,7 +85,8 @@ def estimate_collection(
     recorded = _spread(chosen, RECORDED_SCENES)
     plans = []
     for done, (name, spec) in enumerate(chosen, 1):
-        plans.append(plan_scene(_open_navmesh(spec, options), name, options.seed, 0, options.rules))
+        navmesh, roofs = _open_floors(spec, options)
+        plans.append(plan_scene(navmesh, name, options.seed, 0, options.rules, roofs))
         if progress is not None:
             progress(name, done, len(chosen))
     cost = _record_samples(
@@ -105,9 +106,15 @@ def _spread(specs: Sequence[tuple[str, str]], count: int) -> list[tuple[str, str
     return [specs[int(number * step)] for number in range(min(count, len(specs)))]
 
 
-def _open_navmesh(spec: str, options: NavigationCollection) -> NavMesh:
-    """Return a scene's navigation mesh; an apartment's without its textures and light, in a fraction of the time."""
-    return NavMesh.build(open_outline(spec)) if is_generated(spec) else world(spec, options.backend).navmesh
+def _open_floors(spec: str, options: NavigationCollection) -> tuple[NavMesh, Collection[int]]:
+    """Return a scene's navigation mesh and its roofs.
+
+    An apartment is opened without its textures and light, in a fraction of the time; it has no roof to walk on.
+    """
+    if is_generated(spec):
+        return NavMesh.build(open_outline(spec)), ()
+    place = world(spec, options.backend)
+    return place.navmesh, place.roofs
 
 
 @dataclass(frozen=True)

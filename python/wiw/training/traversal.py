@@ -8,7 +8,7 @@ agent is never moved in any other way: a segment begins with the pose in which t
 from __future__ import annotations
 
 import heapq
-from collections.abc import Iterator, Sequence
+from collections.abc import Collection, Iterator, Sequence
 from dataclasses import dataclass
 from hashlib import blake2b
 from typing import Literal
@@ -84,8 +84,15 @@ class Traversal:
         return sum(map(len, self.segments))
 
 
-def plan_scene(navmesh: NavMesh, scene: str, seed: int, pass_index: int, rules: NavigationRules) -> list[Traversal]:
-    """Plan one pass over all islands of a scene; a pure function of its arguments.
+def plan_scene(
+    navmesh: NavMesh,
+    scene: str,
+    seed: int,
+    pass_index: int,
+    rules: NavigationRules,
+    roofs: Collection[int] = (),
+) -> list[Traversal]:
+    """Plan one pass over all islands of a scene but its roofs; a pure function of its arguments.
 
     Args:
         navmesh: of the scene.
@@ -93,10 +100,11 @@ def plan_scene(navmesh: NavMesh, scene: str, seed: int, pass_index: int, rules: 
         seed: of the dataset.
         pass_index: from 0; other passes have other samples and starts.
         rules: the numbers of the algorithm.
+        roofs: islands to leave out.
     """
     name = int.from_bytes(blake2b(scene.encode(), digest_size=8).digest(), "little")
     traversals, left = [], rules.max_scene_frames
-    for island in choose_islands(navmesh, rules):
+    for island in choose_islands(navmesh, rules, roofs):
         if left < 2:
             break
         key = core.fold_key([seed, name, pass_index, island])
@@ -105,9 +113,10 @@ def plan_scene(navmesh: NavMesh, scene: str, seed: int, pass_index: int, rules: 
     return traversals
 
 
-def choose_islands(navmesh: NavMesh, rules: NavigationRules) -> list[int]:
-    """Return the islands to traverse: the largest, and others that are large enough."""
-    return [index for index, each in enumerate(navmesh.islands) if not index or each.area > rules.min_island_area]
+def choose_islands(navmesh: NavMesh, rules: NavigationRules, roofs: Collection[int] = ()) -> list[int]:
+    """Return the islands to traverse: the largest, and others that are large enough; no roofs."""
+    floors = [index for index in range(len(navmesh.islands)) if index not in roofs]
+    return [index for index in floors if index == floors[0] or navmesh.islands[index].area > rules.min_island_area]
 
 
 def plan_traversal(

@@ -105,7 +105,7 @@ def find_straight_paths(
     world: World, count: int, key: int, shortest: float, longest: float, tries: int = 20
 ) -> list[StraightPath]:
     """Find up to `count` paths that start all over a scene, each as long as it is free, at most `longest`."""
-    starts = world.navmesh.sample(tries * count, key).astype(np.float64)
+    starts = world.navmesh.sample(tries * count, key, world.floor).astype(np.float64)
     headings = 2 * np.pi * core.uniform(core.fold_key([key, 1]), len(starts))
     steps = np.arange(1, round(longest / PROBE_SPACING) + 1) * PROBE_SPACING
     probes = starts[:, None] + steps[:, None] * _compute_directions(headings)[:, None]

@@ -55,8 +55,8 @@ def _row(world: Any, views: int, backend: str) -> Image.Image:
 
 
 def _spread_places(world: Any, count: int) -> NDArray[np.float64]:
-    """Places on the largest island, the first amid the others, each next one as far from those before as can be."""
-    points = np.asarray(world.ground.put_down(world.navmesh.sample(256, 1)), np.float64)
+    """Places on the largest floor, the first amid the others, each next one as far from those before as can be."""
+    points = np.asarray(world.ground.put_down(world.navmesh.sample(256, 1, world.floor)), np.float64)
     chosen = [int(np.argmin(np.linalg.norm(points - np.median(points, axis=0), axis=1)))]
     while len(chosen) < max(1, count):
         nearest = np.min([np.linalg.norm(points - points[i], axis=1) for i in chosen], axis=0)

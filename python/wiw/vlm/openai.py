@@ -215,7 +215,9 @@ class OpenAIClient(Client):
                 )
             except _NoCompletionError as error:
                 passing, said, kind, wait = True, _short(error), "protocol", None
-            except (openai.APIError, _BrokenOffError) as error:
+            except _BrokenOffError as error:
+                passing, said, kind, wait = True, _short(error), "unreachable", None
+            except openai.APIError as error:
                 passing, said, kind, wait = True, f"{type(error).__name__}: {_short(error)}", "unreachable", None
             if not passing or retries.count + 1 >= self.attempts:
                 times = f"{retries.count + 1} tries" if retries.count else "1 try"

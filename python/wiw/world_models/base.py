@@ -405,9 +405,19 @@ def require_frames(model: WorldModel, frames: Any, observations: Conditioning, c
         kind, came = _breach(frames, expected)
         raise ContractError(
             f"{type(model.unwrapped).__name__}.rollout: expected uint8 {expected} (batch, actions + 1, height, "
-            f"width, 3), got {came}",
+            f"width, 3), got {came}{_advise(kind, frames)}",
             kind,
         )
+
+
+def _advise(kind: str, frames: Any) -> str:
+    """Return what to do about frames of another type or dtype; empty where that depends on the model."""
+    if kind == "type" and hasattr(frames, "numpy"):
+        return ". Give a NumPy array, as frames.detach().cpu().numpy() of a torch tensor"
+    if kind == "dtype" and np.issubdtype(frames.dtype, np.floating):
+        scaled = "255 * frames" if frames.size and frames.min() >= 0 and frames.max() <= 1 else "frames"
+        return f". Round, clip and convert: ({scaled}).round().clip(0, 255).astype(numpy.uint8)"
+    return ""
 
 
 def _breach(frames: Any, expected: tuple[int, ...]) -> tuple[str, str]:

@@ -74,7 +74,7 @@ class Survey:
 
 def choose_places(world: World, count: int, key: int) -> NDArray[np.float64]:
     """Return about `count` places on the floor from which one can walk to most others, float64 [n, 3]."""
-    points = world.ground.put_down(world.navmesh.sample(count, key)).astype(np.float64)
+    points = world.ground.put_down(world.navmesh.sample(count, key, world.floor)).astype(np.float64)
     reached = np.isfinite(world.navmesh.distance_matrix(points))
     return points[reached[int(reached.sum(axis=1).argmax())]]
 

@@ -258,7 +258,8 @@ def _hide(fork: WorldFork, instances: Instances) -> DrawnFork:
 
 def _draw_floor(fork: WorldFork, count: int, generator: np.random.Generator) -> NDArray[np.float64]:
     """Return places on free floor near the agent, float64 [count, 3]; anywhere on it where there is little near."""
-    places = np.asarray(fork.world.navmesh.sample(16 * count, int(generator.integers(2**31))), np.float64)
+    here = fork.world
+    places = np.asarray(here.navmesh.sample(16 * count, int(generator.integers(2**31)), here.floor), np.float64)
     near = np.linalg.norm(places - fork.core.position, axis=1) < AROUND
     return (places[near] if near.sum() >= count else places)[:count]
 

@@ -64,7 +64,7 @@ def draw_windows(scene: str, count: int, seed: int) -> list[Window]:
 def _draw_mixed(here: World, count: int, key: int) -> list[Window]:
     segments = [
         (traversal.north, segment)
-        for traversal in plan_scene(here.navmesh, here.name, key % 2**63, 0, NavigationRules())
+        for traversal in plan_scene(here.navmesh, here.name, key % 2**63, 0, NavigationRules(), here.roofs)
         for segment in traversal.segments
     ]
     starts = [(index, at) for index, (_, each) in enumerate(segments) for at in range(len(each) - LENGTH + 1)]
