@@ -20,7 +20,7 @@ from wiw.judging import Judge, Judgement
 from wiw.metrics.metric import ANSWER_SCORE
 from wiw.report.export import tables
 from wiw.report.tables import as_text
-from wiw.runs.store import store_path
+from wiw.runs.store_file import store_path
 from wiw.studies.run_log import load_run
 
 STATE, ATTRIBUTE, WORLD = "object state recognition", "attribute recognition", "world knowledge"

@@ -27,7 +27,7 @@ from wiw.mapping.occupancy import OccupancyGrid
 from wiw.report.beliefs import list_beliefs, list_expected, read_verdict
 from wiw.report.site import write_view
 from wiw.runs.rows import decode_jpeg
-from wiw.runs.store import store_path
+from wiw.runs.store_file import store_path
 from wiw.studies.evaluate import run_arms
 from wiw.types import Decision, Episode
 

@@ -22,7 +22,8 @@ from wiw.analysis.blame_schemes import LOOP
 from wiw.cli import main
 from wiw.errors import ArgumentError, FileError, StoreError
 from wiw.runs.recipes import AgentRecipe, TaskRecipe
-from wiw.runs.store import RunStore, store_path
+from wiw.runs.store import RunStore
+from wiw.runs.store_file import store_path
 from wiw.studies.evaluate import evaluate, resume_run, run_arms
 
 PARTS = Path(__file__).with_name("blame_parts.py")

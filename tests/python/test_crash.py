@@ -20,7 +20,8 @@ from crash_victims import EPISODES, Victims, evaluate
 import wiw
 from wiw.errors import FileError, StoreError
 from wiw.files import atomic_file, atomic_folder
-from wiw.runs.store import RunStore, store_path
+from wiw.runs.store import RunStore
+from wiw.runs.store_file import store_path
 from wiw.studies.run_log import load_run
 
 KILLS = [(20, 4, 16), pytest.param((1500, 200, 300), marks=[pytest.mark.nightly, pytest.mark.timeout(7200)])]

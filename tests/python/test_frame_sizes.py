@@ -26,7 +26,8 @@ from wiw.loop.rollout_cache import Cached, RolloutCache
 from wiw.policies.base import FrameSpec, Policy
 from wiw.policies.matcher import SOURCE, Matcher
 from wiw.runs.merge import merge
-from wiw.runs.store import RunStore, store_path
+from wiw.runs.store import RunStore
+from wiw.runs.store_file import store_path
 from wiw.serving.background import serve_in_background
 from wiw.studies.model_check import examine_model
 from wiw.tasks.imagenav import ImageNav

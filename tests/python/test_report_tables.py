@@ -15,7 +15,7 @@ from wiw.analysis.costs import COLUMNS, costs
 from wiw.analysis.summary import show_estimate
 from wiw.cli import main
 from wiw.report import tables
-from wiw.runs.store import store_path
+from wiw.runs.store_file import store_path
 from wiw.studies.evaluate import run_arms
 
 ARMS = ("none", "copy", "warp", "placebo-shuffled:a_model_with_a_long_name", "oracle")

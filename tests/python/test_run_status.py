@@ -21,7 +21,8 @@ from wiw.errors import StoreError
 from wiw.runs.processes import describe_process, is_running
 from wiw.runs.recipes import AgentRecipe, TaskRecipe
 from wiw.runs.rows import to_json
-from wiw.runs.store import RunStore, store_path
+from wiw.runs.store import RunStore
+from wiw.runs.store_file import store_path
 from wiw.studies.evaluate import evaluate, resume_run
 
 TASK = f"{Path(__file__).with_name('fakes.py')}:line_task"

@@ -12,7 +12,8 @@ from fakes import LineAgent, LineTask
 from wiw.report.episodes import read_stories
 from wiw.report.story import Album
 from wiw.runs.pictures import choose_episodes, choose_pictured_episodes, pool_episodes, spread_evenly
-from wiw.runs.store import RunStore, store_path
+from wiw.runs.store import RunStore
+from wiw.runs.store_file import store_path
 from wiw.studies.evaluate import run_arms
 
 EPISODES = LineTask().episodes(40)

@@ -20,7 +20,8 @@ from wiw.errors import ArgumentError, FileError, StoreError
 from wiw.runs import file_systems, scratch
 from wiw.runs.recipes import AgentRecipe, TaskRecipe
 from wiw.runs.shards import Shard
-from wiw.runs.store import RunStore, store_path
+from wiw.runs.store import RunStore
+from wiw.runs.store_file import store_path
 from wiw.studies.evaluate import evaluate, resume_run
 from wiw.studies.run_log import load_run
 

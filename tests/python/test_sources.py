@@ -14,7 +14,7 @@ import wiw
 from wiw.errors import StoreError
 from wiw.runs.recipes import AgentRecipe, TaskRecipe
 from wiw.runs.sources import require_sources, source_digests
-from wiw.runs.store import store_path
+from wiw.runs.store_file import store_path
 from wiw.runs.verify import verify
 from wiw.serving.background import serve_in_background
 from wiw.studies.evaluate import evaluate, resume_run

@@ -13,7 +13,7 @@ from wiw.analysis.statistics import compute_p_value, estimate_difference
 from wiw.cli import main
 from wiw.errors import ArgumentError, StoreError
 from wiw.metrics.metric import SUCCESS
-from wiw.runs.store import store_path
+from wiw.runs.store_file import store_path
 from wiw.studies.evaluate import run_arms
 from wiw.studies.run_log import load_run
 

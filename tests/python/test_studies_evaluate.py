@@ -20,7 +20,7 @@ from wiw.experiments.gating import Gated
 from wiw.experiments.placebos import ShuffledPlacebo
 from wiw.loop.attempts import Attempted
 from wiw.runs.recipes import AgentRecipe, TaskInMemory, TaskRecipe, absolute, arm_recipes
-from wiw.runs.store import store_path
+from wiw.runs.store_file import store_path
 from wiw.studies.evaluate import evaluate, resume_run, run_arms
 from wiw.studies.run_log import load_run
 

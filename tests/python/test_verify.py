@@ -12,7 +12,7 @@ import wiw
 from wiw.cli import main
 from wiw.errors import ArgumentError, StoreError
 from wiw.runs.recipes import AgentRecipe, TaskRecipe
-from wiw.runs.store import store_path
+from wiw.runs.store_file import store_path
 from wiw.studies.evaluate import evaluate, run_arms
 
 TASK = f"{Path(__file__).with_name('fakes.py')}:line_task"

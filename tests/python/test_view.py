@@ -18,7 +18,7 @@ from wiw.cli import main
 from wiw.errors import ArgumentError, FileError, StoreError
 from wiw.report.site import PictureFolder, write_view
 from wiw.runs.rows import decode_jpeg, encode_jpeg
-from wiw.runs.store import store_path
+from wiw.runs.store_file import store_path
 from wiw.studies.evaluate import run_arms
 from wiw.types import Episode
 

@@ -17,7 +17,7 @@ from wiw.datasets.worlds import navmesh_file, world
 from wiw.errors import FileError, StoreError
 from wiw.nav import NavMesh, NavMeshSettings
 from wiw.runs.recipes import AgentRecipe, TaskRecipe
-from wiw.runs.store import store_path
+from wiw.runs.store_file import store_path
 from wiw.studies.evaluate import evaluate, resume_run
 from wiw.training.navigation_rules import NavigationRules
 from wiw.training.traversal import choose_islands

@@ -22,7 +22,8 @@ from folders import contents
 from test_crash import facts, whole
 
 import wiw.errors
-from wiw.runs.store import RunStore, store_path
+from wiw.runs.store import RunStore
+from wiw.runs.store_file import store_path
 
 SMALL = {"episodes": 2, "keep_images": 1}
 SAMPLE = 4

@@ -94,7 +94,7 @@ def _guard(watch: int, done: threading.Event) -> None:
 
 def stoppable(work: Callable[[], Any], folder: Path, command: str = "resume") -> Any:
     """Run `work` on a run's folder; if it is stopped, print the command that resumes it."""
-    from wiw.runs.store import store_path
+    from wiw.runs.store_file import store_path
 
     try:
         return work()

@@ -211,6 +211,6 @@ def _ask_servers(prepared: PreparedRun, folder: Path) -> str:
 def _is_done(shard: Path) -> bool:
     """Return whether a shard has ended all its episodes."""
     from wiw.runs.status import status
-    from wiw.runs.store import store_path
+    from wiw.runs.store_file import store_path
 
     return store_path(shard).is_file() and all(store.state == "done" for store in status(shard).stores)

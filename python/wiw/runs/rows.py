@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from wiw.errors import ArgumentError, StoreError
-from wiw.types import Answer, ArmObservation, DecisionRecord, EpisodeResult, Fidelity, TextAnswer, Truth
+from wiw.types import Answer, ArmObservation, DecisionRecord, Episode, EpisodeResult, Fidelity, TextAnswer, Truth
 
 STRIP_HEIGHT = 160
 JPEG_QUALITY = 85
@@ -212,3 +212,38 @@ def decode_jpeg(data: bytes) -> NDArray[np.uint8]:
     if image is None:
         raise StoreError(f"a picture of {len(data)} bytes is no JPEG; the run store is damaged")
     return np.asarray(cv2.cvtColor(image, cv2.COLOR_BGR2RGB), np.uint8)
+
+
+def to_episode_values(index: int, episode: Episode) -> tuple[Any, ...]:
+    """Return an episode as the values of its row in table `episode`, in order."""
+    values = asdict(episode)
+    return (
+        index,
+        values["episode_id"],
+        values["scene"],
+        *map(float, values["start_position"]),
+        float(values["start_yaw"]),
+        *map(float, values["goal_position"]),
+        float(values["goal_yaw"]),
+        float(values["geodesic"]) if math.isfinite(values["geodesic"]) else None,
+        to_json(values["info"]),
+    )
+
+
+def build_episode(row: Mapping[str, Any], info: dict[str, Any]) -> Episode:
+    """Return the episode of a row of table `episode`, whose `info` is decoded."""
+    return Episode(
+        row["episode_id"],
+        row["scene"],
+        (row["start_x"], row["start_y"], row["start_z"]),
+        row["start_yaw"],
+        (_read_length(row["goal_x"]), _read_length(row["goal_y"]), _read_length(row["goal_z"])),
+        row["goal_yaw"],
+        _read_length(row["geodesic"]),
+        info,
+    )
+
+
+def _read_length(value: float | None) -> float:
+    """Return metres; NaN where they are not known."""
+    return math.nan if value is None else value

@@ -9,7 +9,8 @@ from typing import Any
 
 from wiw.errors import ArgumentError, StoreError
 from wiw.registry import TASKS, task_class
-from wiw.runs.store import FILE_NAME, RunStore, store_path
+from wiw.runs.store import RunStore
+from wiw.runs.store_file import FILE_NAME, store_path
 from wiw.types import TableSpec
 
 

@@ -7,30 +7,41 @@ about to write. Episodes without an outcome are partial; resuming discards and r
 
 from __future__ import annotations
 
-import fcntl
 import json
 import math
 import sqlite3
 from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
-from contextlib import ExitStack, closing, contextmanager, suppress
-from dataclasses import asdict
+from contextlib import contextmanager, suppress
 from datetime import datetime, timezone
-from functools import cache
 from pathlib import Path
 from typing import Any
 
 import wiw
 from wiw import benchmark
 from wiw.errors import ArgumentError, StoreError
+from wiw.runs import configurations
 from wiw.runs.faults import explain_faults, find_remedy
 from wiw.runs.file_systems import find_network
 from wiw.runs.judges import JudgedRow, JudgeRecord, apply_judge, find_judge
 from wiw.runs.migrations import OLDEST_READABLE, migrate, show_as_current
 from wiw.runs.processes import describe_process
-from wiw.runs.rows import AgentRow, DecisionRow, LostRow, OutcomeRow, to_json
+from wiw.runs.rows import AgentRow, DecisionRow, LostRow, OutcomeRow, build_episode, to_episode_values, to_json
 from wiw.runs.scratch import ScratchCopy
 from wiw.runs.shapes import check_decision, check_types, parse_column
 from wiw.runs.shards import Shard
+from wiw.runs.store_file import (
+    FILE_NAME,
+    SCHEMA,
+    connect,
+    has_log,
+    is_blank,
+    list_columns,
+    lock_both,
+    lock_store,
+    make_folder,
+    remove_store,
+    store_path,
+)
 from wiw.types import Episode
 
 SCHEMA_VERSION = 11
@@ -54,14 +65,6 @@ OUTCOME_JSON = ("metrics", "details")
 """Columns of table `outcome` that hold JSON."""
 APPLICATION_ID = 0x77697721
 """Marks the file as a run store (SQLite's application_id)."""
-FILE_NAME = "run.sqlite"
-_SCHEMA = Path(__file__).with_name("schema.sql")
-
-
-def store_path(run: str | Path) -> Path:
-    """Return the store's file, from a run's folder or the file itself."""
-    path = Path(run).expanduser()
-    return path if path.suffix == ".sqlite" else path / FILE_NAME
 
 
 class RunStore:
@@ -107,18 +110,18 @@ class RunStore:
                 f"{store_path(run)} holds a run already; continue it with `wiw resume {store_path(run).parent}` "
                 "(or evaluate(..., resume=True)), or give another output folder"
             )
-        _make_folder(store_path(run))
-        lock = _lock(path) if copy is None else _lock_both(copy)
+        make_folder(store_path(run))
+        lock = lock_store(path) if copy is None else lock_both(copy)
         if copy is not None:
             copy.discard()
-        store = cls(path, _connect(path, lock), lock, copy)
+        store = cls(path, connect(path, lock), lock, copy)
         with store._close_on_error():
             store._fill(created or _now(), config, info, episodes)
         return store
 
     def _fill(self, created: str, config: dict[str, Any], info: dict[str, Any], episodes: Iterable[Episode]) -> None:
         with self._writing() as connection:
-            for statement in _SCHEMA.read_text().split(";\n"):
+            for statement in SCHEMA.read_text().split(";\n"):
                 connection.execute(statement)
             connection.execute(f"PRAGMA application_id = {APPLICATION_ID}")
             connection.execute(f"PRAGMA user_version = {SCHEMA_VERSION}")
@@ -128,14 +131,14 @@ class RunStore:
             )
             connection.executemany(
                 "INSERT INTO episode VALUES (?, ?, ?, ?, ?, ?, ?, ?, ?, ?, ?, ?, ?)",
-                [_episode_values(index, episode) for index, episode in enumerate(episodes)],
+                [to_episode_values(index, episode) for index, episode in enumerate(episodes)],
             )
 
     @staticmethod
     def exists(run: str | Path) -> bool:
         """Return whether a run is there, rather than nothing or a creation that was cut off."""
         path = store_path(run)
-        return path.exists() and (find_network(path) is not None or not _blank(path))
+        return path.exists() and (find_network(path) is not None or not is_blank(path))
 
     @staticmethod
     def can_be_read(run: str | Path) -> bool:
@@ -145,7 +148,7 @@ class RunStore:
             StoreError: the file is damaged.
         """
         path = store_path(run)
-        return path.is_file() and not _blank(path, writing=False)
+        return path.is_file() and not is_blank(path, writing=False)
 
     @classmethod
     def resume(
@@ -171,12 +174,14 @@ class RunStore:
         if scratch is not None and path.exists():
             store = cls._take_in(ScratchCopy(path, Path(scratch)))
         else:
-            store = cls._open(path, _lock(path) if path.exists() else None)
+            store = cls._open(path, lock_store(path) if path.exists() else None)
         with store._close_on_error():
             store.require_version()
             if config is not None:
                 wanted = json.loads(to_json(config))
-                _require_same(path, store.config, _drop_new_arms(store.config, wanted) if more_arms else wanted)
+                configurations.require_same(
+                    path, store.config, configurations.drop_new_arms(store.config, wanted) if more_arms else wanted
+                )
             store._discard_partial()
         return store
 
@@ -212,7 +217,7 @@ class RunStore:
         Raises:
             StoreError: the task differs; says in what.
         """
-        _require_same(self.path, self.config["task"], json.loads(to_json(task)))
+        configurations.require_same(self.path, self.config["task"], json.loads(to_json(task)))
 
     def require_same(self, begun_with: dict[str, Any], now: dict[str, Any]) -> None:
         """Check a mapping against the one that the run was started with.
@@ -220,7 +225,7 @@ class RunStore:
         Raises:
             StoreError: it differs; says in what.
         """
-        _require_same(self.path, begun_with, now)
+        configurations.require_same(self.path, begun_with, now)
 
     @classmethod
     def read(cls, run: str | Path) -> RunStore:
@@ -239,12 +244,12 @@ class RunStore:
             StoreError: missing, damaged, of another schema, or in use.
         """
         path = store_path(run)
-        return cls._open(path, _lock(path) if path.exists() else None)
+        return cls._open(path, lock_store(path) if path.exists() else None)
 
     @classmethod
     def _take_in(cls, copy: ScratchCopy) -> RunStore:
         """Open a store for writing on a local disk."""
-        lock = _lock_both(copy)
+        lock = lock_both(copy)
         try:
             copy.take_in()
         except BaseException:
@@ -256,7 +261,7 @@ class RunStore:
     def _open(cls, path: Path, lock: Any, copy: ScratchCopy | None = None) -> RunStore:
         if not path.is_file():
             raise StoreError(f"no run at {path}: expected a folder with {FILE_NAME} in it")
-        store = cls(path, _connect(path, lock), lock, copy)
+        store = cls(path, connect(path, lock), lock, copy)
         with store._close_on_error():
             store._require_whole()
             store._require_readable()
@@ -266,7 +271,7 @@ class RunStore:
     def _require_whole(self) -> None:
         """Check the file's length: SQLite reads a last page that is cut short as zeros."""
         pages, size = (self._rows(f"PRAGMA {name}")[0][name] for name in ("page_count", "page_size"))
-        if not _has_log(self.path) and self.path.stat().st_size < pages * size:  # in this order: a log may just go
+        if not has_log(self.path) and self.path.stat().st_size < pages * size:  # in this order: a log may just go
             raise StoreError(f"{self.path}: the file is cut short; {find_remedy(self.path, 'malformed')}")
 
     def _require_readable(self) -> None:
@@ -287,7 +292,7 @@ class RunStore:
 
     def _require_columns(self) -> None:
         """Check that the tables have the columns that this version writes: a damaged schema may still be SQL."""
-        for table, columns in _list_columns().items():
+        for table, columns in list_columns().items():
             found = {row["name"]: row["type"] for row in self._rows(f"PRAGMA main.table_info({table})")}
             if not columns.items() <= found.items():
                 wrong = next(name for name in columns if found.get(name) != columns[name])
@@ -356,7 +361,7 @@ class RunStore:
         """Return the episodes that every arm runs; their place in the list is their index."""
         rows = self._convert_types("episode", self._rows("SELECT * FROM episode ORDER BY episode"))
         infos = [parse_column("episode.info", row["info"], self._place("episode", row)) for row in rows]
-        return [_episode(row, info) for row, info in zip(rows, infos, strict=True)]
+        return [build_episode(row, info) for row, info in zip(rows, infos, strict=True)]
 
     @property
     def judges(self) -> list[JudgeRecord]:
@@ -585,7 +590,7 @@ class RunStore:
         agent = json.loads(to_json(row.agent))
         built = info.setdefault("built", {})
         if row.arm in built:
-            _require_same(self.path, built[row.arm], agent)
+            configurations.require_same(self.path, built[row.arm], agent)
             return
         built[row.arm] = agent
         with self._writing() as connection:
@@ -710,7 +715,7 @@ class RunStore:
         home = self.home
         self._end(keep=False)
         if not home.exists():
-            _remove(home)
+            remove_store(home)
 
     def close(self) -> None:
         """Close the file and let others write; a store on a local disk is copied to its own folder, and removed."""
@@ -788,17 +793,6 @@ class RunStore:
         return rows[0][column]
 
 
-@cache
-def _list_columns() -> dict[str, dict[str, str]]:
-    """Return the columns of each table of a store, with the types that its schema names."""
-    with closing(sqlite3.connect(":memory:")) as connection:
-        connection.executescript(_SCHEMA.read_text())
-        tables = [name for (name,) in connection.execute("SELECT name FROM sqlite_master WHERE type = 'table'")]
-        return {
-            table: {row[1]: row[2] for row in connection.execute(f"PRAGMA table_info({table})")} for table in tables
-        }
-
-
 @contextmanager
 def remove_if_empty(begun: RunStore) -> Iterator[None]:
     """Remove a new run where an error ends the work on it before anything was recorded.
@@ -816,118 +810,13 @@ def remove_if_empty(begun: RunStore) -> Iterator[None]:
                 "AS n"
             )
             if counted["n"] == 0:
-                _remove(path)
+                remove_store(path)
         raise
-
-
-def _remove(path: Path) -> None:
-    """Remove a store, and its folder if nothing else is in it."""
-    for name in ("", "-wal", "-shm"):
-        path.with_name(path.name + name).unlink(missing_ok=True)
-    path.with_suffix(".lock").unlink(missing_ok=True)
-    with suppress(OSError):  # other files are in it
-        path.parent.rmdir()
-
-
-def _make_folder(path: Path) -> None:
-    try:
-        path.parent.mkdir(parents=True, exist_ok=True)
-    except OSError as error:
-        raise StoreError(
-            f"cannot make the run's folder {path.parent} ({error.strerror}); expected free space and the right to "
-            "write there: make room, or choose another with out= or --out"
-        ) from error
-
-
-def _connect(path: Path, lock: Any = None) -> sqlite3.Connection:
-    """Connect; a connection that may write is for the holder of the lock, which is released if connecting fails."""
-    try:
-        with explain_faults(path):
-            return _open_file(path, writing=lock is not None)
-    except StoreError:
-        if lock is not None:
-            lock.close()
-        raise
-
-
-def _open_file(path: Path, writing: bool) -> sqlite3.Connection:
-    uri = f"{path.absolute().as_uri()}?mode={'rwc' if writing else 'ro'}"
-    connection = _plain(uri)
-    if writing:
-        connection.execute("PRAGMA journal_mode = WAL")
-        connection.execute("PRAGMA synchronous = NORMAL")
-        connection.execute("PRAGMA foreign_keys = ON")
-        return connection
-    try:
-        connection.execute("SELECT 1 FROM sqlite_master")
-    except sqlite3.OperationalError:
-        connection.close()
-        if _has_log(path):
-            raise
-        return _plain(uri + "&immutable=1")  # a reader makes a small file too, for which a full disk has no room
-    return connection
-
-
-def _plain(uri: str) -> sqlite3.Connection:
-    connection = sqlite3.connect(uri, uri=True, isolation_level=None, timeout=30)
-    connection.row_factory = sqlite3.Row
-    return connection
-
-
-def _has_log(path: Path) -> bool:
-    """Return whether transactions lie in the log beside the file."""
-    log = path.with_name(path.name + "-wal")
-    return log.exists() and log.stat().st_size > 0
-
-
-def _blank(path: Path, writing: bool = True) -> bool:
-    """Return whether a creation was cut off before anything was written: the schema and the run are one transaction.
-
-    One that was cut off with a log may need a writer, who takes that in.
-    """
-    with explain_faults(path):
-        connection = _open_file(path, writing)
-        (tables,) = connection.execute("SELECT count(*) FROM sqlite_master").fetchone()
-        connection.close()
-    return bool(tables == 0)
-
-
-def _lock(path: Path) -> Any:
-    """Take an advisory lock that the kernel drops when its holder dies, so that a run never has two writers."""
-    if kind := find_network(path):
-        raise StoreError(
-            f"{path.parent} is on a network file system ({kind}), on which SQLite's log is not safe; expected a local "
-            "disk: give a folder on this machine's own disk, as in --scratch /tmp (scratch=), and the store is written "
-            "there and copied here; or a local folder with --out (out=), and then `wiw merge` it to here"
-        )
-    try:
-        handle = path.with_suffix(".lock").open("w")
-    except OSError as error:
-        raise StoreError(
-            f"cannot write in the run's folder {path.parent} ({error.strerror}); expected free space and the right to "
-            "write there: make room, or choose another with out= or --out"
-        ) from error
-    try:
-        fcntl.flock(handle, fcntl.LOCK_EX | fcntl.LOCK_NB)
-    except OSError:
-        handle.close()
-        raise StoreError(f"{path} is being written by another process; wait for it to end or stop it") from None
-    return handle
 
 
 def _now() -> str:
     """Return the time, ISO 8601 in UTC."""
     return datetime.now(timezone.utc).isoformat(timespec="seconds")
-
-
-def _lock_both(copy: ScratchCopy) -> ExitStack:
-    """Lock a store on a local disk, and its own file where that is on one too: somebody may write it there."""
-    with ExitStack() as locks:
-        for path in (copy.path, copy.home):
-            if path is copy.path or find_network(path) is None:
-                _make_folder(path)
-                locks.enter_context(_lock(path))
-        return locks.pop_all()
 
 
 def _insert(connection: sqlite3.Connection, table: str, values: dict[str, Any]) -> None:
@@ -954,76 +843,5 @@ def _forget(connection: sqlite3.Connection, condition: str, values: tuple[Any, .
         connection.execute(f"DELETE FROM {table} AS d WHERE {condition}", values)
 
 
-def _drop_new_arms(stored: dict[str, Any], wanted: dict[str, Any]) -> dict[str, Any]:
-    """Return the wanted configuration with none but the stored one's arms, in its order."""
-    arms = {arm["name"]: arm for arm in wanted["arms"]}
-    return {**wanted, "arms": [arms[arm["name"]] for arm in stored["arms"] if arm["name"] in arms]}
-
-
-def _list_differences(stored: dict[str, Any], wanted: dict[str, Any], prefix: str = "") -> list[str]:
-    """Return where two configurations differ, by dotted names; of arms with unlike names the names alone."""
-    found = []
-    for name in sorted(stored.keys() | wanted.keys()):
-        values = [_by_name(each.get(name)) for each in (stored, wanted)]
-        if values[0] == values[1]:
-            continue
-        both = isinstance(values[0], dict) and isinstance(values[1], dict)
-        if both and (name != "arms" or values[0].keys() == values[1].keys()):
-            found += _list_differences(values[0], values[1], f"{prefix}{name}.")
-        else:
-            shown = [", ".join(value) if both else to_json(value) for value in values]
-            found.append(f"{prefix}{name}: the run has {shown[0]}, now {shown[1]}")
-    return found
-
-
-def _by_name(value: Any) -> Any:
-    """Return the descriptions of arms by their names, and anything else as it is."""
-    items = value if isinstance(value, list) else []
-    is_arms = all(isinstance(item, dict) and item.keys() == {"name", "agent"} for item in items)
-    return {item["name"]: item["agent"] for item in items} if items and is_arms else value
-
-
-def _require_same(path: Path, stored: dict[str, Any], wanted: dict[str, Any]) -> None:
-    if stored == wanted:
-        return
-    detail = "; ".join(_list_differences(stored, wanted))
-    raise StoreError(
-        f"{path} is a run of another configuration ({detail}); resume it as it was begun or give another folder"
-    )
-
-
-def _episode_values(index: int, episode: Episode) -> tuple[Any, ...]:
-    values = asdict(episode)
-    return (
-        index,
-        values["episode_id"],
-        values["scene"],
-        *map(float, values["start_position"]),
-        float(values["start_yaw"]),
-        *map(float, values["goal_position"]),
-        float(values["goal_yaw"]),
-        float(values["geodesic"]) if math.isfinite(values["geodesic"]) else None,
-        to_json(values["info"]),
-    )
-
-
 _TYPES: dict[str, tuple[type, ...]] = {"TEXT": (str,), "INTEGER": (int,), "REAL": (float, int), "BLOB": (bytes,)}
 """Python types by SQLite's names."""
-
-
-def _episode(row: dict[str, Any], info: dict[str, Any]) -> Episode:
-    return Episode(
-        row["episode_id"],
-        row["scene"],
-        (row["start_x"], row["start_y"], row["start_z"]),
-        row["start_yaw"],
-        (_read_length(row["goal_x"]), _read_length(row["goal_y"]), _read_length(row["goal_z"])),
-        row["goal_yaw"],
-        _read_length(row["geodesic"]),
-        info,
-    )
-
-
-def _read_length(value: float | None) -> float:
-    """Return metres; NaN where they are not known."""
-    return math.nan if value is None else value
