@@ -283,6 +283,14 @@ def test_skins_are_drawn_in_the_pose_of_the_file(tmp_path: Path) -> None:
         load(save(glb, tmp_path / "b.glb", skins=broken["skins"]))
 
 
+def test_a_file_that_shows_nothing_says_why(tmp_path: Path) -> None:
+    """By glTF 2.0, 3.5.1, a file without scenes is a library, and nothing of it is drawn."""
+    with pytest.raises(FileError, match="has nodes but no scene that says which of them to show"):
+        load(save(textured_square(), tmp_path / "library.glb", scenes=[]))
+    with pytest.raises(FileError, match="names a scene that is not there"):
+        load(save(textured_square(), tmp_path / "other.glb", scene=3))
+
+
 @pytest.mark.parametrize("with_texture", [False, True])
 def test_emissive_only_surfaces_are_drawn(tmp_path: Path, with_texture: bool) -> None:
     glb = textured_square()

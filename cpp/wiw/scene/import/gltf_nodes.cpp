@@ -113,6 +113,14 @@ const Json& scene_roots(const Json& document) {
 }
 
 void check_gltf_size(const Json& document, const ImportLimits& limits, const std::string& path) {
+  const std::size_t scenes = document["scenes"].items().size();
+  if (scenes == 0 && !document["nodes"].items().empty()) {  // glTF 2.0, 3.5.1: such a file is a library of things
+    throw FileError(path,
+                    "has nodes but no scene that says which of them to show (a library of things, not a place); "
+                    "add a scene with the nodes to show, or export it anew as a scene");
+  }
+  const auto scene = document["scene"].whole();
+  if (scene && *scene >= scenes) throw FileError(path, "names a scene that is not there (damaged file)");
   NodeCounter(document, limits, path).total(scene_roots(document), 0);
   check_vertices(document, limits, path);
 }
