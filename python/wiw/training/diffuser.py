@@ -3,7 +3,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from copy import deepcopy
 from dataclasses import dataclass
 from functools import partial
@@ -20,9 +20,9 @@ from wiw._core import core
 from wiw.datasets.demonstration import decode_colors, decode_depths
 from wiw.errors import ArgumentError
 from wiw.policies.diffuser.diffusion import ALPHA_BARS, NOISE_LEVELS, add_noise
-from wiw.policies.diffuser.network import Network, Shape, Views, stack_views
+from wiw.policies.diffuser.network import Network, Shape, Views, to_tensors
 from wiw.policies.diffuser.paths import MIDDLE, to_vectors
-from wiw.policies.diffuser.workspace import PinholeCamera, WorkspaceView
+from wiw.policies.diffuser.workspace import PinholeCamera, WorkspaceView, stack_views
 from wiw.training.checkpoint import Checkpoint, ResumableTrainer
 from wiw.training.trainer import apply_gradients, run_training, warmup_cosine_schedule
 
@@ -94,12 +94,7 @@ def extract_samples(
     if not found:
         raise ArgumentError("diffuser: expected demonstrations to learn from, got none")
     views, poses, paths = zip(*found, strict=True)
-    return Samples(tuple(_stack(each) for each in zip(*views, strict=True)), np.stack(poses), np.stack(paths))
-
-
-def _stack(views: Sequence[WorkspaceView]) -> WorkspaceView:
-    """Return N views by one camera as one."""
-    return WorkspaceView(*(np.stack([getattr(each, name) for each in views]) for name in ("image", "height", "places")))
+    return Samples(tuple(stack_views(each) for each in zip(*views, strict=True)), np.stack(poses), np.stack(paths))
 
 
 @dataclass(frozen=True)
@@ -265,6 +260,4 @@ def _augment_view(
     """Return the chosen rows in another light [B, 1, 1, 3], rotated by matrices [B, 3, 3] about the middle."""
     images = (view.image[chosen] * light).clip(0, 255).astype(np.uint8)
     places = np.einsum("bij,bhwj->bhwi", turns, view.places[chosen] - MIDDLE) + MIDDLE
-    return stack_views(
-        [WorkspaceView(*each) for each in zip(images, view.height[chosen], places.astype(np.float32), strict=True)]
-    )
+    return to_tensors(WorkspaceView(images, view.height[chosen], places.astype(np.float32)))

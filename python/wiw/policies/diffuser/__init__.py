@@ -19,7 +19,7 @@ from wiw.errors import ArgumentError, DependencyError
 from wiw.networks import single_thread
 from wiw.policies.base import Policy, Situation
 from wiw.policies.diffuser.paths import densify_path, drop_repeated_poses, thin_path, to_poses, to_vectors
-from wiw.policies.diffuser.workspace import PinholeCamera, WorkspaceView
+from wiw.policies.diffuser.workspace import PinholeCamera, WorkspaceView, stack_views
 from wiw.tabletop.workbench import CAMERAS, WRIST
 from wiw.types import GRIPPER_POSES, ArmObservation, Proposal
 
@@ -91,14 +91,14 @@ class Diffuser(Policy):
         import torch
 
         from wiw.policies.diffuser.diffusion import sample_ddim
-        from wiw.policies.diffuser.network import stack_views
+        from wiw.policies.diffuser.network import to_tensors
 
         pose, network = situation.observation.pose, self._network
         views = view_scene(situation.observation, network.shape.wrist)
         drawn = [torch.randn(network.shape.poses, 9, generator=torch.Generator().manual_seed(seed)) for seed in seeds]
         with single_thread(), torch.inference_mode():
             now = torch.from_numpy(to_vectors(pose))[None]
-            scene = network.encode_scene([stack_views([each]) for each in views], now)
+            scene = network.encode_scene([to_tensors(stack_views([each])) for each in views], now)
             noise = torch.stack(drawn)[None]
             clean, open_ = sample_ddim(lambda noised, level: network.denoise(scene, noised, level), noise, self.steps)
             return to_poses(torch.cat([clean, open_[..., None]], dim=-1)[0].numpy())

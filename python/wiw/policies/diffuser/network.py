@@ -10,7 +10,6 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass
 
-import numpy as np
 import torch
 from torch import Tensor, nn
 from torch.nn import functional
@@ -183,12 +182,9 @@ class Block(nn.Module):
         return image + self.inner(image)
 
 
-def stack_views(views: Sequence[WorkspaceView]) -> Views:
+def to_tensors(views: WorkspaceView) -> Views:
     """Return views of B scenes by one camera as tensors."""
-    image, height, places = (
-        torch.from_numpy(np.stack([getattr(view, name) for view in views])) for name in ("image", "height", "places")
-    )
-    return Views(image, height, places)
+    return Views(*(torch.from_numpy(each) for each in (views.image, views.height, views.places)))
 
 
 def to_metres(vectors: Tensor) -> Tensor:

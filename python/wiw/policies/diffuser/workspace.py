@@ -3,6 +3,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from itertools import product
 
@@ -36,6 +37,11 @@ class WorkspaceView:
     """float16 [..., h, w]: above the table, in units of `HEIGHT_UNIT`; -1 where nothing of the workspace is seen."""
     places: NDArray[np.float32]
     """float32 [..., h / CELL, w / CELL, 3]: positions of the cells' centres in metres, or `NOWHERE`."""
+
+
+def stack_views(views: Sequence[WorkspaceView]) -> WorkspaceView:
+    """Return N views by one camera as one, with an axis for them in front."""
+    return WorkspaceView(*(np.stack([getattr(each, name) for each in views]) for name in ("image", "height", "places")))
 
 
 @dataclass(frozen=True)
