@@ -104,6 +104,7 @@ SMALL, LARGE = {"size": [144, 256]}, {"size": [288, 512]}
         ({"warp": ("warp", SMALL), "oracle": ("oracle", {}), "none": (None, {})}, []),
         ({"a": ("warp", {**SMALL, "fill": "far"}), "b": ("warp", {})}, []),
         ({"a": ("warp", SMALL), "b": ("warp", SMALL)}, []),
+        ({"a": ("mine.py:Mine", {"size": 96}), "b": ("mine.py:Mine", {})}, [("a", "b", "96")]),
     ],
 )
 def test_arms_of_one_model_and_several_sizes_are_repeats(models, expected):

@@ -3,7 +3,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Collection, Iterator, Mapping, Sequence
+from collections.abc import Collection, Iterable, Iterator, Mapping
 from dataclasses import dataclass
 from typing import Any
 
@@ -29,23 +29,22 @@ class NoiseFloor:
     """How much an arm differs from itself."""
 
     change: str
-    """What was changed, such as "with frames of 144x256"."""
+    """The change in words, such as "with frames of 144x256"."""
     difference: Difference
     """In SR: the arm with the change minus the one without."""
 
 
 def measure_noise(
-    arms: Sequence[Mapping[str, Any]], done: Mapping[str, Mapping[int, Mapping[str, Any]]], seed: int
+    repeats: Iterable[Repeat], done: Mapping[str, Mapping[int, Mapping[str, Any]]], seed: int
 ) -> tuple[NoiseFloor, ...]:
     """Return how each arm that repeats another one of the run differs from that one in success.
 
     Args:
-        arms: of the run's configuration, each with `name` and `agent`.
+        repeats: of the run's arms.
         done: scored episodes of each arm, by index.
         seed: of the run.
     """
-    agents = {arm["name"]: dict(arm["agent"]) for arm in arms}
-    found = [(one.change, compare(one.arm, one.base, done, SUCCESS, seed)) for one in find_repeats(agents)]
+    found = [(one.change, compare(one.arm, one.base, done, SUCCESS, seed)) for one in repeats]
     return tuple(NoiseFloor(change, difference) for change, difference in found if difference is not None)
 
 
@@ -58,8 +57,8 @@ def find_repeats(agents: Mapping[str, Agent]) -> Iterator[Repeat]:
         yield Repeat(arm, base, "with other random numbers")
     parts = {arm: _split_size(agent) for arm, agent in agents.items()}
     for arm, base in _pair_with_first(parts, "size"):
-        size = parts[arm]["size"] or parts[base]["size"]
-        yield Repeat(arm, base, f"with frames of {size[0]}x{size[1]}")
+        size = parts[arm]["size"]
+        yield Repeat(arm, base, f"with frames of {'x'.join(map(str, size)) if isinstance(size, list) else size}")
 
 
 def _pair_with_first(agents: Mapping[str, Agent], key: str) -> Iterator[tuple[str, str]]:

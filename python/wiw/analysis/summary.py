@@ -24,7 +24,7 @@ from wiw.analysis.breakdowns import (
 )
 from wiw.analysis.flip_test import FEWEST_SCENES
 from wiw.analysis.marks import BLIND, Marks, answer_blind, read_marks
-from wiw.analysis.noise_floor import NoiseFloor, measure_noise
+from wiw.analysis.noise_floor import NoiseFloor, find_repeats, measure_noise
 from wiw.analysis.statistics import LEVEL, Difference, Estimate, adjust_p_values, compare, estimate_mean
 from wiw.analysis.utility import CEILING, FLOOR, Utility, utility
 from wiw.errors import RegistryError
@@ -296,9 +296,15 @@ def summarise_run(run: Run) -> Summary:
         answers={arm: answers[arm] for arm in run.arms if arm in answers},
         departures=read_departures(run.store.info),
         looks=_describe_looks(run.store.info),
-        noise=measure_noise(run.store.config["arms"], split_outcomes(run.arms, outcomes)[0], run.store.config["seed"]),
+        noise=_measure_noise(run, outcomes),
         tiers=tiers,
     )
+
+
+def _measure_noise(run: Run, outcomes: Sequence[Mapping[str, Any]]) -> tuple[NoiseFloor, ...]:
+    """Return how much arms differ from themselves; few runs have such arms, and only theirs are scored once more."""
+    repeats = list(find_repeats({arm["name"]: dict(arm["agent"]) for arm in run.store.config["arms"]}))
+    return measure_noise(repeats, split_outcomes(run.arms, outcomes)[0], run.store.config["seed"]) if repeats else ()
 
 
 def _describe_noise(noise: NoiseFloor) -> str:
