@@ -179,7 +179,7 @@ def _draw_boxes(observation: Observation, target: Target) -> dict[str, Any]:
 
 @dataclass(frozen=True)
 class CameraView:
-    """What a manipulator perceives by a camera other than the fixed front one."""
+    """A view by a manipulator's camera other than the fixed front one."""
 
     image: NDArray[np.uint8]
     """uint8 [480, 480, 3]."""

@@ -94,7 +94,7 @@ def carry_out(victims: Victims, work: Work, folder: Path, number: int, way: str)
 
 WORKS = ("run", "run on a local disk", "resume", "merge", "csv", "parquet", "view", "report", "collect", "train")
 FILES = ("csv", "parquet", "view", "report")
-"""Those that write files or folders at once."""
+"""Jobs that write files or folders at once."""
 
 
 @pytest.mark.parametrize("name", WORKS)

@@ -29,8 +29,8 @@ USUAL_CORRELATION, USUAL_WEIGHT = 0.2, 0.25
 """Correlation within scenes that is assumed where the outcomes hardly vary, and the sum of squared deviations that this
 assumption counts for. Few successes cannot show whether they gather in few scenes."""
 LENGTH_WEIGHT = 2
-"""Made-up episodes that steady lengths, one at either end of their range, each worth as many as the scenes leave of one
-(as Agresti and Coull, 1998, do for proportions with four)."""
+"""Made-up episodes that steady lengths, one at either end of their range, each worth as many real ones as the design
+effect (as Agresti and Coull, 1998, steady proportions with four)."""
 HALVINGS = 40
 """Steps of the bisection for an end of Tango's interval: to 2e-12."""
 

@@ -39,12 +39,13 @@ def find_roofs(navmesh: NavMesh, renderer: Renderer) -> frozenset[int]:
     """
     found = set()
     if len(navmesh.islands) > 1:
-        triangles, owners = navmesh.triangles()
+        triangles, owners = (np.asarray(each) for each in navmesh.triangles())
+        triangles = triangles.astype(np.float64)
         for index, island in enumerate(navmesh.islands):
             if island.area < LEAST_AREA:
                 continue
             places = np.asarray(navmesh.sample(PLACES, 0, index), np.float64)
-            covering = _has_floor_below(places, np.asarray(triangles, np.float64)[np.asarray(owners) != index])
+            covering = _has_floor_below(places, triangles[owners != index])
             if covering.mean() >= COVERED and _is_open_above(places, renderer).mean() >= OPEN:
                 found.add(index)
     return frozenset(found)

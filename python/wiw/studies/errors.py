@@ -62,7 +62,7 @@ class ErrorSettings:
     preset: str | None = None
     """Rules of the tasks, by name or by the path of a YAML file (`wiw.tasks.presets`); each task's default if None."""
     tier: str | None = None
-    """Of Image-Goal Navigation: near, far, beyond, or all; episodes of no tier if None."""
+    """Tier of Image-Goal Navigation: near, far, beyond, or all; episodes of no tier if None."""
     policy: str | None = None
     """The preset's, or else the task's own, if None."""
     size: tuple[int, int] | None = None
@@ -80,7 +80,6 @@ class ErrorSettings:
                 f"errors: expected 1 to 3 doses and 1 or more episodes, in all and in a scene, got {self.doses}, "
                 f"{self.episodes} and {self.per_scene}"
             )
-
         if self.tier is not None and self.tasks != ("imagenav",):
             raise ArgumentError(f"errors: expected imagenav alone for a tier, got {', '.join(self.tasks)}")
 
@@ -154,8 +153,8 @@ def study_errors(
         found.save()
 
     The same call goes on where an earlier one was stopped, episode by episode; with more kinds, doses or tasks it adds
-    them. Runs are ordinary ones, a part of the
-    episodes each: `wiw merge runs/errors/imagenav` makes one of them, `wiw report` and `wiw view` show it.
+    them. Runs are ordinary ones, a part of the episodes each: `wiw merge runs/errors/imagenav` makes one of them, `wiw
+    report` and `wiw view` show it.
 
     Args:
         out: folder of the study, with a folder of runs for each task.

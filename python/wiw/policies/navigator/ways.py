@@ -44,7 +44,7 @@ class Ways:
 
 
 class WayMap:
-    """What is known of the floor in the cells of a way map."""
+    """Knowledge of the floor in the cells of a way map."""
 
     def __init__(self, grid: OccupancyGrid, cells: WayCells) -> None:
         self.cells = cells
