@@ -72,7 +72,6 @@ def describe_surroundings():
         "locale": locale.setlocale(locale.LC_ALL),
         "signals": [signal.getsignal(number) for number in (signal.SIGINT, signal.SIGTERM)],
         "numpy": np.geterr(),
-        "threads": threading.active_count(),
         "streams": (sys.stdin.closed, sys.stdout.closed),
     }
 
@@ -91,7 +90,7 @@ DEAR = ("change_torch",)
     ids=lambda way: way.__name__,
 )
 def test_what_a_model_does_stays_in_its_process(model, way, capfd) -> None:
-    before = describe_surroundings()
+    before, threads = describe_surroundings(), threading.enumerate()
     hangs = way.__name__.startswith(("hang", "stop"))
     try:
         frames = ask(model, way, 0.3 if hangs else 30.0)
@@ -104,6 +103,7 @@ def test_what_a_model_does_stays_in_its_process(model, way, capfd) -> None:
         time.sleep(0.1 if way.__name__ == "change_answer_later" else 0)
         np.testing.assert_array_equal(frames, imagine(observe(way), CONTROLS))
     assert describe_surroundings() == before
+    assert not [each for each in threading.enumerate() if each not in threads]
     good = Attempted(model, 30.0).rollout(observe(), CONTROLS, np.zeros(2, np.uint64))
     np.testing.assert_array_equal(good, imagine(observe(), CONTROLS))
     assert "noise" not in capfd.readouterr().out

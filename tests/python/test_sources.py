@@ -11,7 +11,7 @@ from pathlib import Path
 import pytest
 
 import wiw
-from wiw.errors import StoreError
+from wiw.errors import ConstructionError, StoreError
 from wiw.runs.recipes import AgentRecipe, TaskRecipe
 from wiw.runs.sources import require_sources, source_digests
 from wiw.runs.store_file import store_path
@@ -101,6 +101,36 @@ def test_an_edited_model_is_no_part_of_its_old_run(folder: Path, two_rooms: str,
             go_on()
     (folder / name).write_text(text)
     assert resume_run(run, progress=False).complete and verify(run).same
+
+
+BROKEN = """
+from own import Own
+
+
+class Broken(Own):
+    def __init__(self):
+        raise ValueError("no weights")
+"""
+
+
+def test_a_model_that_could_not_be_made_is_mended_and_the_run_resumes(folder: Path, two_rooms: str) -> None:
+    (folder / "broken.py").write_text(BROKEN)
+    task, run = TaskRecipe("imagenav", {"scenes": two_rooms, "decisions": 1}), folder / "run"
+    agent = AgentRecipe("heuristic")
+    with pytest.raises(ConstructionError, match="no weights") as caught:
+        evaluate(task, agent, 2, out=run, arms=["none", f"{folder}/broken.py:Broken"], progress=False)
+    assert caught.value.__notes__ == [f"What was recorded is kept. Once the cause is mended:  wiw resume {run}"]
+    mended = "from own import Own\n\n\nclass Broken(Own):\n    pass\n"
+    (folder / "broken.py").write_text(mended)
+    log = resume_run(run, progress=False)
+    assert log.complete and verify(run).same
+    (changed,) = log.store.info["sources_changed"]
+    assert changed["files"] == [str(folder / "broken.py")]
+    with sqlite3.connect(store_path(run)) as store:
+        store.execute("DELETE FROM outcome WHERE arm != 'none' AND episode = 1")
+    (folder / "broken.py").write_text(mended + "# edited\n")
+    with pytest.raises(StoreError, match=r"source files have changed.*broken\.py"):
+        resume_run(run, progress=False)
 
 
 def test_a_model_in_memory_is_held_to_its_file_too(folder: Path, two_rooms: str) -> None:

@@ -262,7 +262,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     except Error as error:
         if debug:
             raise
-        print(f"wiw: {printable(error)}", file=sys.stderr)
+        print(f"wiw: {printable(error)}", *map(printable, getattr(error, "__notes__", ())), sep="\n", file=sys.stderr)
         return EXIT_ERROR
     except KeyboardInterrupt:
         return EXIT_INTERRUPTED

@@ -15,7 +15,7 @@ from wiw.runs.progress import ArmProgress, Board, Tracker, make_board
 from wiw.runs.recipes import AgentRecipe, TaskRecipe
 from wiw.runs.rows import AgentRow, DecisionRow, LostRow, RestartRow
 from wiw.runs.scene_map import draw_scene_maps
-from wiw.runs.sources import require_sources
+from wiw.runs.sources import exists, require_sources
 from wiw.runs.store import RunStore
 from wiw.runs.workers import Job, Row, WorkerSpec, run_here, run_in_workers
 from wiw.types import Episode, EpisodeResult
@@ -78,6 +78,29 @@ def require_own_sources(store: RunStore, task: Any, agents: Mapping[str, Any]) -
     except StoreError:
         store.close()
         raise
+
+
+def update_own_sources(store: RunStore, task: Any, agents: Mapping[str, Any]) -> None:
+    """Store the user's own source files as they are now, before a run goes on; close the store where it must not.
+
+    Files that no ended episode was run with may have changed: a model that could not be made is mended, and the run
+    resumes.
+
+    Raises:
+        StoreError: a file that ended episodes were run with has changed since.
+    """
+    begun_with, now = store.info.get("sources"), sources_of(task, agents)
+    if begun_with is None or begun_with == now:
+        return
+    ended = {row["arm"] for row in store.recorded_outcomes() if row["status"] == "done"}
+    fixed = sources_of(task, {arm: recipe for arm, recipe in agents.items() if arm in ended})
+    kept = {path: digest for path, digest in begun_with.items() if path in fixed or not exists(path)}
+    try:
+        require_sources(store.path.parent, kept if ended else None, fixed)
+    except StoreError:
+        store.close()
+        raise
+    store.change_sources(now)
 
 
 def require_left(task: Any, store: RunStore, arms: Iterable[str], retry_errors: bool = False) -> None:

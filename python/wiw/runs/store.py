@@ -612,6 +612,17 @@ class RunStore:
                 (to_json(config), to_json({**self.info, **info, "arms_added": log})),
             )
 
+    def change_sources(self, sources: Mapping[str, str]) -> None:
+        """Store digests of the user's source files; `info["sources_changed"]` lists which changed, and when."""
+        info = self.info
+        old = info.get("sources", {})
+        changed = sorted(path for path in old.keys() | sources.keys() if old.get(path) != sources.get(path))
+        log = [*info.get("sources_changed", []), {"time": _now(), "files": changed}]
+        with self._writing() as connection:
+            connection.execute(
+                "UPDATE run SET info = ?", (to_json({**info, "sources": dict(sources), "sources_changed": log}),)
+            )
+
     def change_settings(self, changes: Mapping[str, Any]) -> None:
         """Store settings that the run goes on with; `info["resumed_with"]` lists what was changed, and when."""
         info = self.info
@@ -794,8 +805,8 @@ class RunStore:
 
 
 @contextmanager
-def remove_if_empty(begun: RunStore) -> Iterator[None]:
-    """Remove a new run where an error ends the work on it before anything was recorded.
+def leave_resumable(begun: RunStore) -> Iterator[None]:
+    """Where an error ends the work on a new run, note on it how the run goes on, or remove one without any record.
 
     So a wrong token or missing weights leave no run behind that can neither be begun again nor resumed. An
     interruption leaves it.
@@ -803,7 +814,7 @@ def remove_if_empty(begun: RunStore) -> Iterator[None]:
     path = begun.home
     try:
         yield
-    except Exception:
+    except Exception as error:
         with suppress(StoreError), RunStore.read(path) as store:
             (counted,) = store._rows(
                 "SELECT (SELECT count(*) FROM decision) + (SELECT count(*) FROM outcome) + (SELECT count(*) FROM lost) "
@@ -811,6 +822,8 @@ def remove_if_empty(begun: RunStore) -> Iterator[None]:
             )
             if counted["n"] == 0:
                 remove_store(path)
+            elif store.info["task"] is not None:  # else it was begun with objects, and no command can resume it
+                error.add_note(f"What was recorded is kept. Once the cause is mended:  wiw resume {path.parent}")
         raise
 
 

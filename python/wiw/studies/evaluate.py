@@ -18,13 +18,13 @@ from wiw.loop.limits import Limits
 from wiw.metrics import Lpips
 from wiw.runs.config import EngineConfig, ResumeConfig, RunConfig, read_resume_settings, take_settings
 from wiw.runs.departures import describe_departures
-from wiw.runs.execute import read_recipes, require_left, require_own_sources, run_pending, sources_of
+from wiw.runs.execute import read_recipes, require_left, run_pending, sources_of, update_own_sources
 from wiw.runs.pictures import pool_episodes
 from wiw.runs.platform import describe_platform
 from wiw.runs.recipes import AgentRecipe, TaskInMemory, TaskRecipe, agent_recipe, arm_recipes, task_recipe
 from wiw.runs.servers import require_servable
 from wiw.runs.shards import Shard
-from wiw.runs.store import RunStore, remove_if_empty
+from wiw.runs.store import RunStore, leave_resumable
 from wiw.studies.run_log import RunLog
 
 
@@ -144,7 +144,7 @@ def resume_run(
             own, whole = store.path.parent, store.path.parent.parent
             raise StoreError(f"{own} holds the reruns of `wiw blame {whole}`; resume them by that command")
         task, agents = read_recipes(store)
-        require_own_sources(store, task, agents)
+        update_own_sources(store, task, agents)
         built = task.build()
         store.require_task(built.describe())
     except Error:
@@ -178,7 +178,7 @@ def _run(task: Any, agents: Mapping[str, Any], settings: RunConfig, more_arms: b
         store = RunStore.resume(settings.out, config, settings.scratch, more_arms)
         begun_with = [arm["name"] for arm in store.config["arms"]]
         require_left(built, store, agents)
-        require_own_sources(store, task, {arm: agents[arm] for arm in begun_with})
+        update_own_sources(store, task, {arm: agents[arm] for arm in begun_with})
         _take_over(store, settings)
         if len(agents) > len(begun_with):
             _add_arms(store, config, _describe_agents(task, agents, built, count))
@@ -210,7 +210,7 @@ def _run(task: Any, agents: Mapping[str, Any], settings: RunConfig, more_arms: b
             "preparation_seconds": time.perf_counter() - started,
         }
         store = RunStore.create(folder, config, info, episodes, settings.scratch)
-        with remove_if_empty(store):
+        with leave_resumable(store):
             return _finish(store, task, agents, settings.workers, settings.progress, settings.place)
     return _finish(store, task, agents, settings.workers, settings.progress, settings.place)
 
