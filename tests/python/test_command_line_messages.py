@@ -61,6 +61,8 @@ def test_list_takes_a_kind(what: str, names: list[str], others: list[str], capsy
         (["--policy-option", "turn=left"], "policy matcher: turn: expected a number, got 'left'"),
         (["--width", "2"], "give --depth 2 or more"),
         (["--fidelity-share", "0.5"], "give --fidelity"),
+        (["--served", "warp"], "say how many by --servers"),
+        (["--cache", "off", "--cache-gb", "3"], "leave one of them out"),
         (["--look-every", "5"], "give --until"),
         (["--policy", "recogniser"], "use it with task ar"),
         (["--scenes", "apartment:val:1"], "wiw: apartment:val:1: no such file"),

@@ -259,6 +259,12 @@ def test_options_need_their_source(reader: str) -> None:
         assert main(["run", "imagenav", "--world-model", reader, *flags]) == 2
 
 
+def test_semantics_need_a_world_model(two_rooms: str, tmp_path: Path, capfd: pytest.CaptureFixture[str]) -> None:
+    begin = ["run", "imagenav", "--scenes", two_rooms, "--episodes", "1", "--semantics", "simulator", "--arms", "none"]
+    assert main([*begin, "--out", str(tmp_path / "run")]) == 2
+    assert "no arm has one" in capfd.readouterr().err and not (tmp_path / "run").exists()
+
+
 def test_an_arm_without_a_model_loads_no_network(tmp_path: Path) -> None:
     options = {"weights": str(tmp_path / "not there")}
     context = RunContext(LineTask())

@@ -89,12 +89,7 @@ class RunConfig(Limits, EngineConfig):
         for name in ("servers", "server_gpus", "vlm_servers", "vlm_server_gpus"):
             if getattr(self, name) < 0:
                 raise ArgumentError(f"evaluate: expected {name} of at least 0, got {getattr(self, name)}")
-        if self.engine != "ray" and self.vlm_servers:
-            raise ArgumentError("evaluate: vlm_servers are for engine ray: give --engine ray (engine=)")
-        if self.fidelity_share != RunConfig.fidelity_share and not self.measures_fidelity:
-            raise ArgumentError("evaluate: fidelity_share needs something to measure: give --fidelity (fidelity=True)")
-        if self.look_every != RunConfig.look_every and self.until is None:
-            raise ArgumentError("evaluate: look_every is between looks of a rule: give --until (until=)")
+        self._require_use()
         if self.shard is not None:
             Shard.parse(self.shard)
         if self.until is not None and self.episodes is None:
@@ -103,6 +98,19 @@ class RunConfig(Limits, EngineConfig):
             )
         if self.until is not None and self.shard is not None:
             raise ArgumentError("evaluate: a shard sees too little of a run to stop it: until cannot be had with shard")
+
+    def _require_use(self) -> None:
+        """Check that no setting is given that the others leave without use."""
+        if self.engine != "ray" and self.vlm_servers:
+            raise ArgumentError("evaluate: vlm_servers are for engine ray: give --engine ray (engine=)")
+        if self.served is not None and not self.servers:
+            raise ArgumentError("evaluate: served is the model that servers have: say how many by --servers (servers=)")
+        if self.cache == "off" and self.cache_gb != RunConfig.cache_gb:
+            raise ArgumentError("evaluate: cache_gb bounds the cache of rollouts, which is off: leave one of them out")
+        if self.fidelity_share != RunConfig.fidelity_share and not self.measures_fidelity:
+            raise ArgumentError("evaluate: fidelity_share needs something to measure: give --fidelity (fidelity=True)")
+        if self.look_every != RunConfig.look_every and self.until is None:
+            raise ArgumentError("evaluate: look_every is between looks of a rule: give --until (until=)")
 
     @property
     def looks(self) -> dict[str, Any] | None:

@@ -495,6 +495,19 @@ def require_reference(name: str, agent: AgentRecipe) -> AgentRecipe:
     return agent
 
 
+def require_semantics_use(agents: Mapping[str, AgentRecipe | AgentInMemory]) -> None:
+    """Check that a source of semantics has a world model to label views for.
+
+    Raises:
+        ArgumentError: semantics are named, and no arm has a world model.
+    """
+    recipes = [recipe for recipe in agents.values() if isinstance(recipe, AgentRecipe) and recipe.semantics is not None]
+    if recipes and all(recipe.model is None for recipe in recipes):
+        raise ArgumentError(
+            "semantics: labels are for a world model, and no arm has one: give --world-model or leave semantics out"
+        )
+
+
 def _change_model(agent: AgentRecipe, text: str) -> AgentRecipe:
     """Return the agent with the world model of an arm, or with a placebo or an error of it."""
     kind, named = placebo_of(text)

@@ -823,7 +823,8 @@ def leave_resumable(begun: RunStore) -> Iterator[None]:
             if counted["n"] == 0:
                 remove_store(path)
             elif store.info["task"] is not None:  # else it was begun with objects, and no command can resume it
-                error.add_note(f"What was recorded is kept. Once the cause is mended:  wiw resume {path.parent}")
+                note = f"What was recorded is kept. Once the cause is mended:  wiw resume {path.parent}"
+                vars(error).setdefault("__notes__", []).append(note)  # as `add_note` of Python 3.11 does
         raise
 
 

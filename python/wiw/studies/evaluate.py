@@ -21,7 +21,15 @@ from wiw.runs.departures import describe_departures
 from wiw.runs.execute import read_recipes, require_left, run_pending, sources_of, update_own_sources
 from wiw.runs.pictures import pool_episodes
 from wiw.runs.platform import describe_platform
-from wiw.runs.recipes import AgentRecipe, TaskInMemory, TaskRecipe, agent_recipe, arm_recipes, task_recipe
+from wiw.runs.recipes import (
+    AgentRecipe,
+    TaskInMemory,
+    TaskRecipe,
+    agent_recipe,
+    arm_recipes,
+    require_semantics_use,
+    task_recipe,
+)
 from wiw.runs.servers import require_servable
 from wiw.runs.shards import Shard
 from wiw.runs.store import RunStore, leave_resumable
@@ -158,6 +166,7 @@ def resume_run(
 
 def _run(task: Any, agents: Mapping[str, Any], settings: RunConfig, more_arms: bool) -> RunLog:
     require_servable(agents, settings.place)
+    require_semantics_use(agents)
     if settings.lpips is not None:
         Lpips(settings.lpips)  # report missing weights before anything is run
     built = task.build()
