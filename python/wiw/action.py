@@ -40,6 +40,7 @@ __all__ = [
     "chunk",
     "frames_of_actions",
     "pad",
+    "relative_poses",
     "resample",
     "to_controls",
     "to_text",
@@ -158,6 +159,17 @@ def to_trajectory(
         ArgumentError: an unknown id.
     """
     return np.asarray(_core.to_trajectory(np.asarray(actions), space or ActionSpace(), include_start))
+
+
+def relative_poses(poses: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Return planar poses [..., N, 3] in the frame of the last of them; azimuths in [-pi, pi)."""
+    last = poses[..., -1:, :]
+    change = poses - last
+    cos, sin = np.cos(last[..., 2]), np.sin(last[..., 2])
+    forward = cos * change[..., 0] + sin * change[..., 1]
+    left = cos * change[..., 1] - sin * change[..., 0]
+    azimuth = np.remainder(change[..., 2] + np.pi, 2 * np.pi) - np.pi
+    return np.stack([forward, left, azimuth], axis=-1)
 
 
 def to_viewpoints(

@@ -311,6 +311,13 @@ class Control:
     """Actions that are the agent's own; the rest is padding."""
     shared: int = 0
 
+    @staticmethod
+    def of_poses(count: int, text: str = "", ids: NDArray[np.float64] | None = None) -> Control:
+        """Return a plan of `count` gripper poses, all the agent's own: in words, or as poses [count + 1, 7]."""
+        actions = np.zeros(count, np.int8)  # null tokens are 0
+        still = np.broadcast_to(np.eye(4), (count, 4, 4))
+        return Control(actions, np.zeros((count, 3)), still, text, ids, length=count)
+
 
 @dataclass(frozen=True)
 class History:
@@ -390,6 +397,19 @@ class Conditioning:
 
     def __len__(self) -> int:
         return len(self.image)
+
+    def rows(self, rows: Sequence[int]) -> Conditioning:
+        """Return some rows; the batch itself where it is all of them."""
+        if list(rows) == list(range(len(self))):
+            return self
+        index = list(rows)
+        return Conditioning(
+            self.image[index],
+            depth=None if self.depth is None else self.depth[index],
+            semantic=None if self.semantic is None else self.semantic[index],
+            history=None if self.history is None else self.history.rows(index),
+            simulators=None if self.simulators is None else [self.simulators[row] for row in index],
+        )
 
 
 @dataclass(frozen=True)

@@ -4,12 +4,16 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Sequence
+import os
+import signal
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
+import torch
+from folders import contents
 
 import tiny_pipelines
 from tiny_nwm import TinyNWM
@@ -27,6 +31,7 @@ from wiw.datasets.parquet_files import MANIFEST
 from wiw.training.post_training.corpora import open_corpus
 from wiw.training.post_training.families import PretrainedWeights, find_family
 from wiw.training.post_training.recipe import PostTrainingRecipe, load_recipe
+from wiw.training.post_training.sampling import TrainingSampler
 from wiw.training.post_training.trainer import PostTrainer
 
 FRAMES = {"svd-action": 3, "ltx-action": 9, "nwm-action": 6}
@@ -128,3 +133,54 @@ def make_trainer(name: str, data: Path, weights: Path, **changes: Any) -> PostTr
 def with_nightly(names: Sequence[str], always: Sequence[str]) -> list[Any]:
     """Names as parameters of a test; those that are not in `always` are run nightly."""
     return [pytest.param(name, marks=[] if name in always else [pytest.mark.nightly]) for name in names]
+
+
+def read_log(out: Path) -> list[dict[str, Any]]:
+    """The lines of a training's log."""
+    return [json.loads(line) for line in (out.with_name(f"{out.name}.log") / "metrics.jsonl").read_text().splitlines()]
+
+
+def require_same_bytes_when_stopped_at_sample(
+    call: int, step: int, train: Callable[[Path], Any], folder: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Train once, and once with Ctrl-C while the model is sampled for the `call`-th time, in the validation at a step:
+    checkpoint and log are the same.
+    """
+    train(folder / "whole")
+    stock, calls = TrainingSampler.__call__, []
+
+    def stop(self: Any, *asked: Any) -> Any:
+        calls.append(len(calls))
+        if len(calls) == call:
+            os.kill(os.getpid(), signal.SIGINT)
+        return stock(self, *asked)
+
+    handler = signal.signal(signal.SIGINT, signal.default_int_handler)  # a job in a shell's background ignores it
+    with monkeypatch.context() as patch, pytest.raises(KeyboardInterrupt):
+        patch.setattr(TrainingSampler, "__call__", stop)
+        train(folder / "stopped")
+    signal.signal(signal.SIGINT, handler)
+    assert torch.load(folder / "stopped.checkpoint", weights_only=True)["step"] == step
+    train(folder / "stopped")
+    assert contents(folder / "whole") == contents(folder / "stopped")
+    logs = [[{**line, "seconds": 0} for line in read_log(folder / name)] for name in ("whole", "stopped")]
+    assert logs[0] == logs[1]
+
+
+def require_sampling_unnoticed(plain: PostTrainer, sampled: PostTrainer, sample: Callable[[], Any]) -> None:
+    """Train two equal trainers, one of which is sampled before and after its steps: the same weights to the last bit,
+    random states and modes of networks.
+    """
+    before = torch.random.get_rng_state()
+    for _ in range(plain.steps_per_epoch * 2):
+        plain.train_step(1e-3)
+        sample()
+        sampled.train_step(1e-3)
+    sample()
+    assert torch.equal(torch.random.get_rng_state(), before)
+    assert all(torch.equal(value, sampled.trained[key]) for key, value in plain.trained.items())
+    modes = [
+        [layer.training for network in trainer.model.list_networks() for layer in network.modules()]
+        for trainer in (plain, sampled)
+    ]
+    assert modes[0] == modes[1]

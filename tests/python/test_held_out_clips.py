@@ -19,13 +19,13 @@ from wiw.metrics import psnr
 from wiw.training.construct_decisions import DecisionRules, construct_decisions
 from wiw.training.decision_errors import measure_decisions
 from wiw.training.held_out_clips import (
-    HeldOutClips,
     fit_steps,
     imagine_with,
     measure_clips,
     shuffle_plans,
-    turn_panoramas,
 )
+from wiw.training.held_out_panoramas import PanoramaClips, turn_panoramas
+from wiw.types import Conditioning
 
 pytest.importorskip("pyarrow", reason="no pyarrow: pip install 'wiw[export]'")
 
@@ -39,29 +39,28 @@ def show(image: np.ndarray, plan: np.ndarray, step: int) -> np.ndarray:
     return turn_panoramas(shifted, np.array(azimuth))
 
 
-def imagine_truth(images: Any, plans: Any, seeds: Any, wanted: Any) -> np.ndarray:
-    return np.stack(
-        [[show(image, plan, s) for s in own] for image, plan, own in zip(images, plans, wanted, strict=True)]
-    )
+def imagine_truth(observations: Any, plans: Any, seeds: Any, wanted: Any) -> np.ndarray:
+    rows = zip(observations.image, plans, wanted, strict=True)
+    return np.stack([[show(image, plan, s) for s in own] for image, plan, own in rows])
 
 
-def imagine_turns(images: Any, plans: Any, seeds: Any, wanted: Any) -> np.ndarray:
+def imagine_turns(observations: Any, plans: Any, seeds: Any, wanted: Any) -> np.ndarray:
     azimuth = np.stack([action.to_trajectory(plan)[own - 1, 2] for plan, own in zip(plans, wanted, strict=True)])
-    return turn_panoramas(np.repeat(images[:, None], wanted.shape[1], 1), azimuth)
+    return turn_panoramas(np.repeat(observations.image[:, None], wanted.shape[1], 1), azimuth)
 
 
 @pytest.fixture(scope="module")
-def clips() -> HeldOutClips:
+def clips() -> PanoramaClips:
     rng = np.random.default_rng(0)
     images = rng.integers(60, 180, (12, HEIGHT, WIDTH, 3)).astype(np.uint8)
     plans = rng.integers(1, 4, (12, 9)).astype(np.int8)
     plans[0] = 2  # turns alone
     wanted = np.tile(STEPS, (12, 1))
-    frames = np.concatenate([images[:, None], imagine_truth(images, plans, None, wanted)], axis=1)
-    return HeldOutClips(("a", "b") * 6, frames, plans, shuffle_plans(plans, rng), STEPS)
+    frames = np.concatenate([images[:, None], imagine_truth(Conditioning(images), plans, None, wanted)], axis=1)
+    return PanoramaClips(("a", "b") * 6, frames, plans, shuffle_plans(plans, rng), STEPS)
 
 
-def test_a_perfect_model_has_no_error_and_a_gap(clips: HeldOutClips) -> None:
+def test_a_perfect_model_has_no_error_and_a_gap(clips: PanoramaClips) -> None:
     errors, (own, _) = measure_clips(imagine_truth, clips, batch=5)
     found = errors.summarise()
     np.testing.assert_array_equal(own, clips.frames[:, 1:])
@@ -69,19 +68,22 @@ def test_a_perfect_model_has_no_error_and_a_gap(clips: HeldOutClips) -> None:
     assert found["gap"] > found["gap/displacements"] > 10
 
 
-def test_a_model_of_turns_alone_has_no_gap_of_displacements(clips: HeldOutClips) -> None:
+def test_a_model_of_turns_alone_has_no_gap_of_displacements(clips: PanoramaClips) -> None:
     found = measure_clips(imagine_turns, clips)[0].summarise()
     assert found["gap/displacements"] == 0 and found["gap"] > 1
     assert found["psnr/turns"] == 100 > found["psnr"]
 
 
-def test_means_are_over_frames_from_another_place(clips: HeldOutClips) -> None:
+def test_means_are_over_frames_from_another_place(clips: PanoramaClips) -> None:
     errors, _ = measure_clips(imagine_turns, clips)
-    assert not errors.moved[0].any() and errors.moved.any()
+    assert not errors.counted[0].any() and errors.counted.any()
     places = np.stack([action.to_trajectory(plan)[np.array(STEPS) - 1, :2] for plan in clips.plans])
-    np.testing.assert_array_equal(errors.moved, np.linalg.norm(places, axis=-1) > 0.1)
-    assert errors.summarise()["psnr/4"] == errors.psnr[errors.moved[:, 1], 1].mean()
-    by_hand = psnr(imagine_turns(clips.frames[3:4, 0], clips.plans[3:4], 0, np.array([[4]]))[0, 0], clips.frames[3, 2])
+    np.testing.assert_array_equal(errors.counted, np.linalg.norm(places, axis=-1) > 0.1)
+    assert errors.summarise()["psnr/4"] == errors.psnr[errors.counted[:, 1], 1].mean()
+    by_hand = psnr(
+        imagine_turns(Conditioning(clips.frames[3:4, 0]), clips.plans[3:4], 0, np.array([[4]]))[0, 0],
+        clips.frames[3, 2],
+    )
     assert errors.psnr[3, 1] == pytest.approx(by_hand, abs=2)  # latitudes weigh a little
 
 
@@ -102,9 +104,9 @@ def test_turning_is_rolling() -> None:
         np.testing.assert_array_equal(turned[:, column], np.roll(frames[:, column], roll, axis=2))
 
 
-def test_a_world_model_imagines_what_is_wanted(clips: HeldOutClips) -> None:
+def test_a_world_model_imagines_what_is_wanted(clips: PanoramaClips) -> None:
     frames = imagine_with(wiw.world_model("copy"))(
-        clips.frames[:, 0], clips.plans, np.zeros(12, np.uint64), np.tile([1, 9], (12, 1))
+        Conditioning(clips.frames[:, 0]), clips.plans, np.zeros(12, np.uint64), np.tile([1, 9], (12, 1))
     )
     np.testing.assert_array_equal(frames, np.repeat(clips.frames[:, :1], 2, axis=1))
 
@@ -128,7 +130,7 @@ def test_decisions_show_where_plans_lead(decisions: Decisions) -> None:
 
 
 def _answer(decisions: Decisions, asked: Any) -> np.ndarray:
-    images, plans = asked[0], asked[1]
+    images, plans = asked[0].image, asked[1]
     index = next(i for i, image in enumerate(decisions.images) if np.array_equal(image, images[0]))
     return turn_panoramas(decisions.futures[index], action.to_trajectory(plans)[:, -1, 2])[:, None]
 

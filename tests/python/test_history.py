@@ -11,12 +11,12 @@ import pytest
 from history_models import Recalling, digest
 
 import wiw
-from wiw.action import FORWARD, TURN_LEFT, TURN_RIGHT, to_trajectory
+from wiw.action import FORWARD, TURN_LEFT, TURN_RIGHT, relative_poses, to_trajectory
 from wiw.errors import ArgumentError
 from wiw.experiments.placebos import SwappedPlacebo
 from wiw.loop.attempts import Attempted
 from wiw.loop.clock import Clock
-from wiw.loop.history import EpisodeHistories, Frame, relative_poses, stack_histories
+from wiw.loop.history import EpisodeHistories, Frame, stack_histories
 from wiw.loop.imagination import ModelInput, Request
 from wiw.loop.memory import Query
 from wiw.loop.plan_space import plan_space

@@ -21,13 +21,26 @@ pytest.importorskip("peft", reason="no peft: pip install 'wiw[diffusers]'")
 pytest.importorskip("pyarrow", reason="no pyarrow: pip install 'wiw[export]'")
 
 import torch
-from post_training_parts import SIZES, make_trainer, save_dataset, save_stock, tiny_recipe, with_nightly
+from post_training_parts import (
+    SIZES,
+    make_trainer,
+    read_log,
+    require_same_bytes_when_stopped_at_sample,
+    require_sampling_unnoticed,
+    save_dataset,
+    save_stock,
+    tiny_recipe,
+    with_nightly,
+)
 
 from wiw.action import PoseGrid
 from wiw.datasets.demonstrations import Demonstrations
+from wiw.training.held_out_clips import measure_clips
+from wiw.training.held_out_demonstrations import DemonstratedPlan, select_demonstrations
 from wiw.training.post_training.corpora import find_ends, open_corpus, spread_frames
 from wiw.training.post_training.families import FAMILIES, VideoFamily, find_family
-from wiw.training.post_training.train import post_train
+from wiw.training.post_training.sampling import create_sampler
+from wiw.training.post_training.train import post_train, write_checkpoint
 from wiw.types import GRIPPER_POSES
 
 pytestmark = pytest.mark.usefixtures("one_torch_thread")
@@ -131,9 +144,7 @@ def test_a_checkpoint_runs_on_poses(name: str, demos: Path, weights: Any, tmp_pa
     model = wiw.world_model(name, checkpoint=str(out), device="cpu", steps=2, **card["run"]["options"], **options)
     assert model.accepts.space == GRIPPER_POSES and model.accepts.view == "perspective"
     clip = open_corpus(demos, "all").clips(recipe.frames)[0]
-    count = recipe.frames - 1
-    still = np.zeros(count, np.int8), np.zeros((count, 3)), np.broadcast_to(np.eye(4), (count, 4, 4))
-    control = Control(*still, ids=clip.actions, length=count)
+    control = Control.of_poses(recipe.frames - 1, ids=clip.actions)
     image = np.full((1, *recipe.size, 3), 90, np.uint8)
     frames = model.rollout(Conditioning(image), [control], np.zeros(1, np.uint64))
     assert frames.shape == (1, recipe.frames, *recipe.size, 3)
@@ -172,3 +183,107 @@ def test_a_state_of_another_corpus_is_refused(demos: Path, weights: Any, tmp_pat
         post_train(name, demos, out, seconds=0, on_step=stop, **options)
     with pytest.raises(ArgumentError, match="other data or options"):
         post_train(name, save_dataset(tmp_path / "data"), out, **options)
+
+
+# -- validation --------------------------------------------------------------------------------------------------------
+
+ON = "wan2.2-5b-action"
+"""The model whose training is validated here."""
+
+
+@pytest.fixture
+def train(demos: Path, weights: Any) -> Any:
+    def train(out: Path, **options: Any) -> dict[str, Any]:
+        split = {"held_out": 0.5, "validate_every": 2, "validate_clips": 2}
+        recipe = tiny_recipe(ON, **{"epochs": 2, **SHAPES[ON], **split, **options.pop("numbers", {})})
+        given = {"weights": weights(ON), "device": "cpu", "recipe": recipe, "seconds": 0, **options}
+        return post_train(ON, demos, out, **given)
+
+    return train
+
+
+def make_plan(name: str, start: float, targets: list[float], frames: int = 5) -> DemonstratedPlan:
+    """A gripper that moves along x, and pictures that are as bright as it is far."""
+    poses = np.zeros((len(targets), 7))
+    poses[:, 0] = targets
+    shown = action.resample(poses, frames - 1, start=np.array([start, *[0.0] * 6]))[:, 0]
+    bright = (200 * np.array([start, *shown])).astype(np.uint8)
+    images = np.repeat(bright, 16 * 16 * 3).reshape(frames, 16, 16, 3)
+    return DemonstratedPlan(name, images, np.array([start, *[0.0] * 6]), poses)
+
+
+def imagine_brightness(observations: Any, plans: np.ndarray, seeds: Any, wanted: np.ndarray) -> np.ndarray:
+    bright = (200 * np.take_along_axis(plans[..., 0], wanted, axis=1)).astype(np.uint8)
+    return np.broadcast_to(bright[..., None, None, None], (*bright.shape, 16, 16, 3)).copy()
+
+
+def test_who_follows_the_gripper_has_no_error_and_a_gap() -> None:
+    plans = [make_plan("a", 0.2, [0.4, 0.8]), make_plan("b", 0.5, [0.1]), make_plan("c", 0.6, [0.7, 0.2, 0.3])]
+    clips = select_demonstrations(plans, 8, 0, (16, 16))
+    assert sorted(clips.scenes) == ["a", "b", "c"] and clips.steps == (1, 4)
+    np.testing.assert_array_equal(clips.shuffled[:, 0], clips.plans[:, 0])  # other plans begin at one's own place
+    assert sorted(clips.shuffled[:, -1, 0]) == sorted(clips.plans[:, -1, 0])
+    assert (clips.shuffled[:, -1, 0] != clips.plans[:, -1, 0]).all()
+    found = measure_clips(imagine_brightness, clips)[0].summarise()
+    assert found["psnr"] == found["psnr/1"] == found["psnr/4"] == 100 and found["gap"] > 50
+    assert set(found) == {"psnr", "psnr/1", "psnr/4", "ssim/1", "ssim/4", "gap"}
+    still = measure_clips(lambda seen, *_: np.repeat(seen.image[:, None], 2, axis=1), clips)[0].summarise()
+    assert still["psnr"] < 30 and still["gap"] == 0
+    alone = select_demonstrations(plans[:1], 8, 0, (16, 16))
+    assert alone.shuffled[0, -1, 0] == 0.4  # a single clip: its poses in reverse
+    apart = measure_clips(imagine_brightness, alone)[0].apart
+    assert apart.tolist() == [[True, True]]
+
+
+@pytest.mark.parametrize("name", with_nightly(NAMES, (ON,)))
+def test_training_does_not_notice_that_it_is_sampled_and_the_checkpoint_imagines_the_same(
+    name: str, demos: Path, weights: Any, tmp_path: Path
+) -> None:
+    plain, sampled = (make_trainer(name, demos, weights(name), **SHAPES[name], epochs=4, rows=4) for _ in range(2))
+    recipe, sampler = sampled.recipe, create_sampler(sampled)
+    clips = sampled.model.select_clips(open_corpus(demos, "all"))
+    asked = clips.observe(slice(0, 2)), clips.plans[:2], np.arange(2, dtype=np.uint64), np.array([[1, 2]] * 2)
+    require_sampling_unnoticed(plain, sampled, lambda: sampler(*asked))
+    write_checkpoint(tmp_path / "out", sampled, {})
+    options = {"guardrail": False} if name.startswith("cosmos") else {}
+    options |= {"size": recipe.size, "frames": recipe.frames}
+    model = wiw.world_model(name, checkpoint=str(tmp_path / "out"), device="cpu", **options)
+    controls = [Control.of_poses(recipe.frames - 1, ids=plan) for plan in asked[1]]
+    frames = np.concatenate(
+        [model.rollout(asked[0].rows([row]), controls[row : row + 1], asked[2][row : row + 1]) for row in range(2)]
+    )
+    np.testing.assert_array_equal(sampler(*asked), frames[:, 1:3])
+
+
+def test_validation_is_on_held_out_demonstrations(train: Any, demos: Path, tmp_path: Path) -> None:
+    told: dict[int, float] = {}
+    card = train(tmp_path / "out", on_validation=lambda step, found: told.update({step: found["psnr"]}))
+    assert list(told) == [0, 2] and card["steps"] == 2
+    held_out, trained = (open_corpus(demos, part, 0.5).units for part in ("held-out", "train"))
+    assert set(card["validated_on"]["demonstrations"]) <= held_out and not held_out & trained
+    assert held_out | trained == open_corpus(demos, "all").units and len(trained | held_out) == 4
+    names = {"psnr", "psnr/1", "psnr/4", "ssim/1", "ssim/4", "gap"}
+    assert set(card["validation"]) == names and all(np.isfinite(value) for value in card["validation"].values())
+    assert {line["step"]: line["validation/psnr"] for line in read_log(tmp_path / "out") if "loss" not in line} == told
+    assert (tmp_path / "out.log" / "step-0000002.png").exists()
+
+
+def test_validation_on_what_is_trained_on_or_of_another_kind_is_refused(
+    train: Any, demos: Path, tmp_path: Path
+) -> None:
+    with pytest.raises(ArgumentError, match="expected demonstrations that are not trained on, got push_buttons"):
+        train(tmp_path / "same", part="all", validation=demos)
+    with pytest.raises(ArgumentError, match=r"`wiw collect manipulation`, .* is of `wiw collect navigation`"):
+        train(tmp_path / "moves", validation=save_dataset(tmp_path / "data"))
+    with pytest.raises(ArgumentError, match="decisions: those of `wiw collect decisions` are an agent's that moves"):
+        train(tmp_path / "decisions", decisions=tmp_path / "d.parquet")
+    with pytest.raises(ArgumentError, match=r"no demonstration of .* is held out; collect more demonstrations"):
+        train(tmp_path / "none", numbers={"held_out": 0.0})
+
+
+@pytest.mark.nightly
+def test_a_training_that_is_stopped_while_it_validates_ends_with_the_same_bytes(
+    train: Any, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    longer = partial(train, numbers={"epochs": 3})
+    require_same_bytes_when_stopped_at_sample(3, 2, longer, tmp_path, monkeypatch)

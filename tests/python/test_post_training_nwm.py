@@ -20,12 +20,29 @@ pytest.importorskip("diffusers", reason="no diffusers: pip install 'wiw[diffuser
 pytest.importorskip("pyarrow", reason="no pyarrow: pip install 'wiw[export]'")
 
 import torch
-from post_training_parts import make_trainer, save_dataset, save_stock
+from post_training_parts import (
+    make_trainer,
+    read_log,
+    require_same_bytes_when_stopped_at_sample,
+    require_sampling_unnoticed,
+    save_dataset,
+    save_stock,
+    tiny_recipe,
+)
 
+from wiw.datasets.decisions import Decisions, save_decisions
+from wiw.training.decision_errors import measure_decisions
+from wiw.training.held_out_clips import imagine_with, measure_clips
+from wiw.training.held_out_front_views import FrontView, FrontViewClips
+from wiw.training.held_out_panoramas import turn_panoramas
 from wiw.training.post_training.clips import load_clips, mirror_clip
-from wiw.training.post_training.corpora import Clip, open_corpus
+from wiw.training.post_training.corpora import Clip, cut_front_views, open_corpus
+from wiw.training.post_training.families import find_family
 from wiw.training.post_training.nwm import VariationalDiffusion, measure_likelihood
+from wiw.training.post_training.sampling import create_sampler
+from wiw.training.post_training.train import post_train, write_checkpoint
 from wiw.world_models.nwm.diffusion import sample
+from wiw.world_models.nwm.images import rows_seen, to_network
 from wiw.world_models.nwm.model import NWM
 
 pytestmark = pytest.mark.usefixtures("one_torch_thread")
@@ -212,3 +229,136 @@ def test_recipes_that_nwm_cannot_have_are_refused(
 ) -> None:
     with pytest.raises(ArgumentError, match=said):
         make_trainer("nwm-action", data, weights, **options)
+
+
+# -- validation --------------------------------------------------------------------------------------------------------
+
+
+@pytest.fixture
+def few_steps(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Two steps of diffusion in place of 250."""
+    monkeypatch.setattr(NWM, "steps", 2)
+
+
+@pytest.fixture
+def train(data: Path, weights: Path, few_steps: None) -> Any:
+    def train(out: Path, **options: Any) -> dict[str, Any]:
+        split = {"held_out": 0.76, "validate_every": 2, "validate_clips": 3}  # leaves "house" for training
+        recipe = tiny_recipe("nwm-action", **{"epochs": 3, **split, **options.pop("numbers", {})})
+        return post_train("nwm-action", data, out, weights=weights, device="cpu", recipe=recipe, seconds=0, **options)
+
+    return train
+
+
+def select_clips(trainer: Any, data: Path) -> FrontViewClips:
+    corpus, _ = find_family("nwm-action").fit(open_corpus(data, "all"), trainer.recipe)
+    return trainer.model.select_clips(corpus)
+
+
+def test_clips_have_a_context_and_what_the_network_sees_of_the_front_view(
+    data: Path, weights: Path, few_steps: None
+) -> None:
+    trainer = make_trainer("nwm-action", data, weights, validate_clips=60)
+    clips = select_clips(trainer, data)
+    assert clips.steps == (1, 4, 8) and clips.frames.shape[1:] == (4, 36, 48, 3)
+    whole = open_corpus(data, "all").clips(12)  # the segments have 12 frames: 4 of context, and 8 actions
+    assert len(clips) == len(whole) == 3
+    for row, plan in enumerate(clips.plans):
+        clip = next(each for each in whole if np.array_equal(each.actions[4:], plan))
+        views = cut_front_views(clip.images, (48, 48))[:, rows_seen(48, 48)]
+        np.testing.assert_array_equal(clips.frames[row], views[[3, 4, 7, 11]])
+        history = clips.observe(slice(row, row + 1)).history
+        np.testing.assert_array_equal(history.images[0], views[:4])
+        np.testing.assert_array_equal(history.actions[0, :, 0], clip.actions[1:4])
+        np.testing.assert_array_equal(history.lengths, [[1, 1, 1]])
+        np.testing.assert_allclose(
+            action.to_trajectory(clip.actions[1:4])[-1, :2], _invert(history.poses[0, 0]), atol=1e-12
+        )
+        full = cut_front_views(clip.images[:2], (48, 48))
+        torch.testing.assert_close(to_network(views[:2], 16), to_network(full, 16), rtol=0, atol=0)
+
+
+def _invert(pose: np.ndarray) -> np.ndarray:
+    """The place of the last frame in the frame of one whose pose in the last frame is given."""
+    x, y, azimuth = pose
+    cos, sin = np.cos(azimuth), np.sin(azimuth)
+    return np.array([-cos * x - sin * y, sin * x - cos * y])
+
+
+def test_frames_that_turns_lead_to_count_and_others_that_lead_elsewhere_make_the_gap() -> None:
+    view = FrontView((48, 48), rows_seen(48, 48))
+    plans = np.array([[TURN_LEFT, TURN_RIGHT], [FORWARD, FORWARD], [TURN_LEFT, TURN_LEFT]], np.int8)
+    frames = np.random.default_rng(0).integers(0, 255, (3, 3, 36, 48, 3)).astype(np.uint8)
+    context = np.repeat(frames[:, :1], 4, axis=1)
+    others = plans[[2, 0, 1]]
+    clips = FrontViewClips(("a",) * 3, frames, plans, others, (1, 2), view, context, np.zeros((3, 3), np.int8))
+    truth = {tuple(plan): shown for plan, shown in zip(plans, frames, strict=True)}
+    errors, _ = measure_clips(lambda _, asked, *__: np.stack([truth[tuple(plan)][1:] for plan in asked]), clips)
+    assert errors.counted.tolist() == [[True, False], [True, True], [True, True]]
+    assert errors.apart.tolist() == [[False, False], [True, True], [True, True]]
+    found = errors.summarise()
+    assert found["psnr"] == found["psnr/2"] == 100 and found["ssim/1"] == pytest.approx(1) and found["gap"] > 80
+    assert set(found) == {"psnr", "psnr/1", "psnr/2", "ssim/1", "ssim/2", "gap"}
+
+
+def test_training_does_not_notice_that_it_is_sampled(data: Path, weights: Path, few_steps: None) -> None:
+    plain, sampled = (make_trainer("nwm-action", data, weights, epochs=4, rows=4, ema=0.5) for _ in range(2))
+    clips, sampler = select_clips(sampled, data), create_sampler(sampled)
+    require_sampling_unnoticed(plain, sampled, lambda: measure_clips(sampler, clips))
+    assert all(torch.equal(value, sampled.averages[name]) for name, value in plain.averages.items())
+
+
+def test_what_is_sampled_in_training_is_what_the_checkpoint_imagines(
+    data: Path, weights: Path, tmp_path: Path, few_steps: None
+) -> None:
+    trainer = make_trainer("nwm-action", data, weights)
+    trainer.train_step(1e-2)
+    write_checkpoint(tmp_path / "out", trainer, {})
+    clips = select_clips(trainer, data)
+    asked = clips.observe(slice(0, 2)), clips.plans[:2], np.arange(2, dtype=np.uint64), np.array([[1, 4], [2, 3]])
+    shown = create_sampler(trainer)(*asked)
+    np.testing.assert_array_equal(
+        shown, imagine_with(NWM(weights=str(tmp_path / "out"), steps=2, device="cpu"))(*asked)
+    )
+    alone = create_sampler(trainer)(Conditioning(asked[0].image), *asked[1:])
+    assert not np.array_equal(shown, alone)  # the context is looked at
+
+
+def test_validation_is_on_front_views_of_held_out_scenes(train: Any, data: Path, tmp_path: Path) -> None:
+    told: dict[int, float] = {}
+    card = train(tmp_path / "out", on_validation=lambda step, found: told.update({step: found["psnr"]}))
+    assert list(told) == [0, 2, 3] and card["steps"] == max((2, 3), key=told.__getitem__)
+    assert card["validated_on"]["scenes"] == ["flat", "loft"]
+    names = {"psnr", "psnr/1", "psnr/4", "psnr/8", "ssim/1", "ssim/4", "ssim/8", "gap"}
+    assert set(card["validation"]) == names and all(np.isfinite(value) for value in card["validation"].values())
+    assert {line["step"]: line["validation/psnr"] for line in read_log(tmp_path / "out") if "loss" not in line} == told
+    assert (tmp_path / "out.log" / "step-0000003.png").exists()
+    with pytest.raises(ArgumentError, match="scenes that are not trained on, got flat, house, loft"):
+        train(tmp_path / "same", part="all", validation=data)
+
+
+def test_a_training_that_is_stopped_while_it_validates_ends_with_the_same_bytes(
+    train: Any, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    require_same_bytes_when_stopped_at_sample(3, 2, train, tmp_path, monkeypatch)
+
+
+def test_rank_agreement_is_measured_on_front_views_of_stored_decisions(train: Any, tmp_path: Path) -> None:
+    """Who imagines what is truly seen ahead chooses as the oracle does, which sees no more than that."""
+    rng = np.random.default_rng(0)
+    seen = rng.integers(0, 255, (2, 5, 32, 64, 3)).astype(np.uint8)
+    plans = np.array([[[1, 1, 0], [2, 1, 1], [3, 1, 0]]] * 2, np.int8)
+    stored = Decisions(("a", "b"), seen[:, 0], seen[:, 1], plans, seen[:, 2:], rng.random((2, 3)))
+    view = FrontView((48, 48), rows_seen(48, 48))
+
+    def imagine_truth(observations: Conditioning, asked: np.ndarray, *_: Any) -> np.ndarray:
+        starts = [cut_front_views(image[None], (48, 48))[0, rows_seen(48, 48)] for image in stored.images]
+        index = next(i for i, start in enumerate(starts) if np.array_equal(start, observations.image[0]))
+        turned = turn_panoramas(stored.futures[index], action.to_trajectory(asked)[:, -1, 2])
+        return cut_front_views(turned, (48, 48))[:, rows_seen(48, 48)][:, None]
+
+    errors = measure_decisions(imagine_truth, stored, view=view)
+    assert errors.agreement.tolist() == [1, 1] and np.array_equal(errors.regret, errors.oracle)
+    save_decisions(tmp_path / "d.parquet", stored)
+    card = train(tmp_path / "out", decisions=tmp_path / "d.parquet", numbers={"epochs": 1})
+    assert -1 <= card["validation"]["rank"] <= 1 and card["validation"]["regret"] >= 0

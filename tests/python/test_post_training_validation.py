@@ -4,8 +4,6 @@
 from __future__ import annotations
 
 import json
-import os
-import signal
 import sys
 import types
 from dataclasses import replace
@@ -26,16 +24,25 @@ pytest.importorskip("peft", reason="no peft: pip install 'wiw[diffusers]'")
 pytest.importorskip("pyarrow", reason="no pyarrow: pip install 'wiw[export]'")
 
 import torch
-from folders import contents
-from post_training_parts import make_trainer, save_dataset, save_stock, tiny_recipe, with_nightly
+from post_training_parts import (
+    make_trainer,
+    read_log,
+    require_same_bytes_when_stopped_at_sample,
+    require_sampling_unnoticed,
+    save_dataset,
+    save_stock,
+    tiny_recipe,
+    with_nightly,
+)
 
 from wiw.training.held_out_clips import imagine_with
 from wiw.training.post_training import validation
 from wiw.training.post_training.families import FAMILIES, VideoFamily
-from wiw.training.post_training.sampling import TrainingSampler, create_sampler
+from wiw.training.post_training.sampling import create_sampler
 from wiw.training.post_training.trackers import open_tracker
 from wiw.training.post_training.train import post_train, write_checkpoint
 from wiw.training.post_training.training_log import TrainingLog
+from wiw.types import Conditioning
 
 NAMES = sorted(name for name, family in FAMILIES.items() if isinstance(family, VideoFamily))
 SPLIT = {"held_out": 0.76, "validate_every": 2, "validate_clips": 3}
@@ -63,33 +70,14 @@ def train(data: Path, weights: Any):
     return train
 
 
-def read_log(out: Path) -> list[dict[str, Any]]:
-    return [json.loads(line) for line in (out.with_name(f"{out.name}.log") / "metrics.jsonl").read_text().splitlines()]
-
-
 @pytest.mark.parametrize("name", with_nightly(NAMES, ("ltx-action", "wan2.2-a14b-action")))
 def test_training_does_not_notice_that_it_is_sampled(name: str, data: Path, weights: Any) -> None:
-    """The same weights to the last bit, and the same random state."""
-    changes = {"epochs": 4, "rows": 4}
-    plain, sampled = (make_trainer(name, data, weights(name), **changes) for _ in range(2))
-    sampler = create_sampler(sampled)
-    frames = plain.recipe.frames
-    images = np.full((2, *sampled.recipe.size, 3), 90, np.uint8)
-    plans, wanted = np.ones((2, frames - 1), np.int8), np.tile([1, frames - 1], (2, 1))
-    before = torch.random.get_rng_state()
-    for _ in range(plain.steps_per_epoch * 2):
-        plain.train_step(1e-3)
-        shown = sampler(images, plans, np.arange(2, dtype=np.uint64), wanted)
-        sampled.train_step(1e-3)
-    assert shown.shape == (2, 2, *sampled.recipe.size, 3)
-    assert torch.equal(torch.random.get_rng_state(), before)
-    assert all(torch.equal(value, sampled.trained[key]) for key, value in plain.trained.items())
-    modes = [
-        [layer.training for layer in getattr(trainer.model.objective.pipeline, place).modules()]
-        for trainer in (plain, sampled)
-        for place in trainer.model.places
-    ]
-    assert modes[: len(modes) // 2] == modes[len(modes) // 2 :]
+    plain, sampled = (make_trainer(name, data, weights(name), epochs=4, rows=4) for _ in range(2))
+    sampler, last = create_sampler(sampled), plain.recipe.frames - 1
+    images = Conditioning(np.full((2, *sampled.recipe.size, 3), 90, np.uint8))
+    asked = images, np.ones((2, last), np.int8), np.arange(2, dtype=np.uint64), np.tile([1, last], (2, 1))
+    require_sampling_unnoticed(plain, sampled, lambda: sampler(*asked))
+    assert sampler(*asked).shape == (2, 2, *sampled.recipe.size, 3)
 
 
 def test_what_is_sampled_in_training_is_what_the_checkpoint_imagines(data: Path, weights: Any, tmp_path: Path) -> None:
@@ -103,7 +91,7 @@ def test_what_is_sampled_in_training_is_what_the_checkpoint_imagines(data: Path,
     )
     images = np.random.default_rng(0).integers(0, 255, (2, *recipe.size, 3)).astype(np.uint8)
     plans, wanted = np.array([[1, 2, 1, 1], [3, 3, 1, 2]], np.int8), np.array([[1, 4], [2, 3]])
-    asked = images, plans, np.arange(2, dtype=np.uint64), wanted
+    asked = Conditioning(images), plans, np.arange(2, dtype=np.uint64), wanted
     np.testing.assert_array_equal(create_sampler(trainer)(*asked), imagine_with(model)(*asked))
 
 
@@ -167,26 +155,7 @@ def test_rank_agreement_is_measured_on_stored_decisions(train: Any, tmp_path: Pa
 def test_a_training_that_is_stopped_while_it_validates_ends_with_the_same_bytes(
     train: Any, tmp_path: Path, monkeypatch: Any
 ) -> None:
-    train(tmp_path / "whole")
-    stock, calls = TrainingSampler.__call__, []
-
-    def stop(self: Any, *asked: Any) -> Any:
-        calls.append(len(calls))
-        if len(calls) == 5:  # in the validation after step 4
-            os.kill(os.getpid(), signal.SIGINT)
-        return stock(self, *asked)
-
-    monkeypatch.setattr(TrainingSampler, "__call__", stop)
-    handler = signal.signal(signal.SIGINT, signal.default_int_handler)  # a job in a shell's background ignores it
-    with pytest.raises(KeyboardInterrupt):
-        train(tmp_path / "stopped")
-    signal.signal(signal.SIGINT, handler)
-    monkeypatch.undo()
-    assert torch.load(tmp_path / "stopped.checkpoint", weights_only=True)["step"] == 4
-    train(tmp_path / "stopped")
-    assert contents(tmp_path / "whole") == contents(tmp_path / "stopped")
-    logs = [[{**line, "seconds": 0} for line in read_log(tmp_path / name)] for name in ("whole", "stopped")]
-    assert logs[0] == logs[1]
+    require_same_bytes_when_stopped_at_sample(5, 4, train, tmp_path, monkeypatch)
 
 
 def test_a_log_forgets_what_comes_later_and_half_a_line(tmp_path: Path) -> None:
@@ -253,19 +222,18 @@ def test_trackers_that_are_not_there_are_refused(tmp_path: Path, monkeypatch: An
         open_tracker("wandb", "run", tmp_path, {})
 
 
-def test_validation_of_a_model_that_has_none_is_refused(data: Path, weights: Any, tmp_path: Path) -> None:
-    given = {"weights": weights("nwm-action"), "device": "cpu", "recipe": tiny_recipe("nwm-action")}
-    with pytest.raises(ArgumentError, match="nwm-action: only models that follow primitives in panoramas"):
-        post_train("nwm-action", data, tmp_path / "out", validation=data, **given)
-
-
 def test_averaged_weights_are_what_is_validated(data: Path, weights: Any) -> None:
     name = "ltx-action"
     trainer = make_trainer(name, data, weights(name), ema=0.5)
     trainer.train_step(1e-1)
     sampler = create_sampler(trainer)
     shape = (1, *trainer.recipe.clip_size, 3)
-    asked = np.full(shape, 90, np.uint8), np.ones((1, 4), np.int8), np.zeros(1, np.uint64), np.array([[4]])
+    asked = (
+        Conditioning(np.full(shape, 90, np.uint8)),
+        np.ones((1, 4), np.int8),
+        np.zeros(1, np.uint64),
+        np.array([[4]]),
+    )
     shown = sampler(*asked)
     with trainer.use_averages():
         averages = {key: value.detach().clone() for key, value in trainer.trained.items()}

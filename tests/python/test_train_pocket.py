@@ -19,15 +19,18 @@ from wiw.training.collect_navigation import collect_navigation
 pytest.importorskip("pyarrow", reason="needs wiw[export]")
 torch = pytest.importorskip("torch", reason="needs wiw[torch]")
 
-from wiw.training.held_out_clips import imagine_with, select_clips  # noqa: E402
+from wiw.training.held_out_clips import imagine_with  # noqa: E402
+from wiw.training.held_out_panoramas import select_panoramas  # noqa: E402
 from wiw.training.pocket.batches import compute_displacements, draw_batch, draw_places  # noqa: E402
 from wiw.training.pocket.held_out import BASELINES, draw_windows, measure, shuffle_places  # noqa: E402
 from wiw.training.pocket.recipe import PocketRecipe  # noqa: E402
 from wiw.training.pocket.train import create_sampler, train_pocket  # noqa: E402
 from wiw.training.pocket.trainer import PocketTrainer, average_sphere  # noqa: E402
+from wiw.training.post_training.corpora import NavigationCorpus  # noqa: E402
 from wiw.training.post_training.recipe import load_recipe  # noqa: E402
 from wiw.training.post_training.validation import ValidationSet  # noqa: E402
 from wiw.training.reduced_frames import ReducedFrames, reduce_frames  # noqa: E402
+from wiw.types import Conditioning  # noqa: E402
 from wiw.world_models.pocket.model import Pocket  # noqa: E402
 from wiw.world_models.pocket.weights import load  # noqa: E402
 from wiw.world_models.warpnet.network import warp  # noqa: E402
@@ -261,10 +264,12 @@ def test_scenes_to_measure_on_must_be_there(dataset: Path, tmp_path: Path, capsy
 def test_validation_keeps_the_best_weights_and_changes_no_training(
     dataset: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    clips = select_clips(NavigationData(dataset).clips(8), 3, 0, SIZE)
+    clips = select_panoramas(NavigationData(dataset).clips(8), 3, 0, SIZE)
     checked = ValidationSet(clips, None, 1, {"made": "of what is trained on, for the test"})
-    monkeypatch.setattr("wiw.training.pocket.train.find_held_out", lambda *_: (None, None))
-    monkeypatch.setattr("wiw.training.pocket.train.choose_validation_set", lambda *_: checked)
+    monkeypatch.setattr(
+        "wiw.training.pocket.train.find_held_out", lambda *_: NavigationCorpus(NavigationData(dataset), "all")
+    )
+    monkeypatch.setattr("wiw.training.pocket.train.build_validation_set", lambda *_: checked)
     told: dict[int, float] = {}
     options = {"on_validation": lambda step, found: told.update({step: found["psnr"]})}
     out = tmp_path / "pocket.safetensors"
@@ -289,7 +294,7 @@ def test_what_is_validated_are_the_averaged_weights_and_they_are_put_back(datase
     imagine = create_sampler(learner)
     before = {name: value.clone() for name, value in learner.trained.items()}
     image = np.random.default_rng(0).integers(0, 255, (1, *SIZE, 3)).astype(np.uint8)
-    asked = image, np.ones((1, 7), np.int8), np.zeros(1, np.uint64), np.array([[7]])
+    asked = Conditioning(image), np.ones((1, 7), np.int8), np.zeros(1, np.uint64), np.array([[7]])
     shown = imagine(*asked)
     assert all(torch.equal(value, before[name]) for name, value in learner.trained.items()) and learner.network.training
     with torch.no_grad():

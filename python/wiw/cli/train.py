@@ -170,10 +170,11 @@ def train(
         device: Of torch, for video models. Default: the GPU if there is one.
         part: Part of the dataset for pocket and video models: train leaves out one in twenty scenes, or demonstrations,
             for validation. Default: train.
-        validation: Another dataset of `wiw collect navigation`, of other scenes, on which pocket or a video model is
-            validated while it trains. Default: the scenes that --part train leaves out.
-        decisions: File of `wiw collect decisions`, by which validation also measures how well the model's order of the
-            plans agrees with the true one.
+        validation: Another dataset of the same command, of other scenes or demonstrations, on which pocket or a video
+            model is validated while it trains: PSNR and SSIM after 1, 4, 8 and 14 actions, and the control gap.
+            Default: those that --part train leaves out.
+        decisions: File of `wiw collect decisions`, by which validation of pocket, or of a video model that moves, also
+            measures how well its order of the plans agrees with the true one.
         tracker: Program that draws loss and validation of pocket or a video model; needs its package.
             OUT.log/metrics.jsonl has the same in any case.
         scenes: Training scenes of recogniser, navigator, warpnet and perception: apartments:train[:N], a mesh, a Gazebo

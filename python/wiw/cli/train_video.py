@@ -226,10 +226,12 @@ def describe_validation(found: Mapping[str, float]) -> str:
     """Return the main figures of a validation."""
     texts = [f"PSNR {found['psnr']:.2f} dB"] if "psnr" in found else []
     if "gap" in found:
-        texts.append(f"control gap {found['gap']:.2f} dB, of displacements {found['gap/displacements']:.2f} dB")
+        texts.append(f"control gap {found['gap']:.2f} dB")
+    if "gap/displacements" in found:
+        texts.append(f"gap of displacements {found['gap/displacements']:.2f} dB")
     if "rank" in found:
         texts.append(f"rank agreement {found['rank']:.2f}")
-    return ", ".join(texts) or "no clip leads to another place"
+    return ", ".join(texts) or "no clip leads anywhere"
 
 
 def _describe_memory() -> str:

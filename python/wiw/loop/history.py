@@ -14,7 +14,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from wiw.action import TURN_LEFT, TURN_RIGHT, ActionSpace, to_trajectory
+from wiw.action import TURN_LEFT, TURN_RIGHT, ActionSpace, relative_poses, to_trajectory
 from wiw.loop.views import take_views
 from wiw.types import ArmObservation, History, Key, Observation
 from wiw.world_models.base import Accepts
@@ -175,17 +175,6 @@ def _from_frame_0(frames: Sequence[Frame]) -> list[Frame]:
     """Express poses in the frame of the last one."""
     poses = relative_poses(np.stack([frame.pose for frame in frames]))
     return [replace(frame, pose=pose) for frame, pose in zip(frames, poses, strict=True)]
-
-
-def relative_poses(poses: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Return planar poses [..., N, 3] in the frame of the last of them; azimuths in [-pi, pi)."""
-    last = poses[..., -1:, :]
-    change = poses - last
-    cos, sin = np.cos(last[..., 2]), np.sin(last[..., 2])
-    forward = cos * change[..., 0] + sin * change[..., 1]
-    left = cos * change[..., 1] - sin * change[..., 0]
-    azimuth = np.remainder(change[..., 2] + np.pi, 2 * np.pi) - np.pi
-    return np.stack([forward, left, azimuth], axis=-1)
 
 
 def stack_histories(rows: Sequence[Sequence[Frame]], most: int) -> History:

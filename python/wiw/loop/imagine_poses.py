@@ -96,15 +96,9 @@ def _make_control(accepts: Accepts, plan: Proposal, here: NDArray[np.float64], w
     poses = plan.actions
     if accepts.frames:
         poses = action.resample(poses, accepts.frames - 1, start=here)
-    count = len(poses)
-    return Control(
-        actions=np.full(count, int(action.NULL), np.int8),
-        trajectory=np.zeros((count, 3)),
-        viewpoints=np.broadcast_to(np.eye(4), (count, 4, 4)),
-        text=plan.text or action.to_text(plan.actions) if tells else "",
-        ids=np.concatenate([here[None], poses]) if accepts.control == "action" else None,
-        length=count,
-    )
+    text = plan.text or action.to_text(plan.actions) if tells else ""
+    ids = np.concatenate([here[None], poses]) if accepts.control == "action" else None
+    return Control.of_poses(len(poses), text, ids)
 
 
 def _split_rows(rows: Sequence[_Row], most: int) -> Iterator[list[int]]:

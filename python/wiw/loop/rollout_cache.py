@@ -190,9 +190,7 @@ class Cached(ModelWrapper):
             ]
         self._cached_rows += len(controls) - len(missing)
         if missing:
-            fresh = self.model.rollout(
-                _select_rows(observations, missing), [controls[row] for row in missing], seeds[missing]
-            )
+            fresh = self.model.rollout(observations.rows(missing), [controls[row] for row in missing], seeds[missing])
             with time_separately("cache"):
                 for answer, row in zip(fresh, missing, strict=True):
                     first, end = own[row]
@@ -243,14 +241,3 @@ def _make_key(
         digest.update(array.data)
     digest.update(f"{control.length}{control.text}".encode())
     return digest.hexdigest()
-
-
-def _select_rows(whole: Conditioning, rows: Sequence[int]) -> Conditioning:
-    """Return some rows of a batch; the batch itself where it is all of them."""
-    if len(rows) == len(whole):
-        return whole
-    index = list(rows)
-    depth = None if whole.depth is None else whole.depth[index]
-    semantic = None if whole.semantic is None else whole.semantic[index]
-    history = None if whole.history is None else whole.history.rows(index)
-    return Conditioning(whole.image[index], depth=depth, semantic=semantic, history=history)

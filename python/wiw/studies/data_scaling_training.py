@@ -21,17 +21,10 @@ from wiw.files import atomic_file
 from wiw.networks import single_thread
 from wiw.studies.data_scaling_plan import ScalingPlan, ScalingSettings, Training
 from wiw.training.decision_errors import DecisionErrors, measure_decisions
-from wiw.training.held_out_clips import (
-    ClipErrors,
-    Frames,
-    HeldOutClips,
-    Imagine,
-    imagine_with,
-    measure_clips,
-    select_clips,
-    turn_panoramas,
-)
+from wiw.training.held_out_clips import Frames, Imagine, imagine_with, measure_clips
+from wiw.training.held_out_panoramas import PanoramaClips, PanoramaErrors, select_panoramas, turn_panoramas
 from wiw.training.learners import Learner, make_learner
+from wiw.types import Conditioning
 
 if TYPE_CHECKING:
     from wiw.training.post_training.recipe import ClipRecipe
@@ -57,7 +50,7 @@ class Material:
     scenes: NDArray[np.str_]
     """[W]: scene of each."""
     frames: ReducedFrames
-    held_out: HeldOutClips
+    held_out: PanoramaClips
     decisions: Decisions
 
     def select_rows(self, training: Training) -> NDArray[np.int64]:
@@ -82,7 +75,7 @@ def load_material(data: Path, folder: Path, settings: ScalingSettings) -> Materi
         clips,
         list_scenes(trained, clips),
         reduce_frames(trained, settings.size, folder / FRAMES),
-        select_clips(held_out.clips(settings.length), settings.held_out_clips, 0, settings.size),
+        select_panoramas(held_out.clips(settings.length), settings.held_out_clips, 0, settings.size),
         load_decisions(folder / DECISIONS),
     )
 
@@ -179,22 +172,22 @@ def create_recipe(learner: Learner, settings: ScalingSettings, clips: int, seed:
     )
 
 
-def measure(imagine: Imagine, clips: HeldOutClips, decisions: Decisions) -> Measures:
+def measure(imagine: Imagine, clips: PanoramaClips, decisions: Decisions) -> Measures:
     """Measure a model on held-out clips and decisions."""
     errors, _ = measure_clips(imagine, clips)
     return tabulate_clips(errors) | tabulate_decisions(measure_decisions(imagine, decisions))
 
 
-def tabulate_clips(errors: ClipErrors) -> Measures:
+def tabulate_clips(errors: PanoramaErrors) -> Measures:
     """Return sums by scene of the error after `STEP` actions, PSNR and SSIM at all steps, and both gaps."""
     levels = 255 * 10 ** (-errors.psnr / 20)
     found = {}
     for column, step in enumerate(errors.steps):
-        moved = errors.moved[:, column]
+        counted = errors.counted[:, column]
         if step == STEP:
-            found["error"] = _sum_by_scene(errors.scenes, levels[:, column], moved)
-        found[f"psnr/{step}"] = _sum_by_scene(errors.scenes, errors.psnr[:, column], moved)
-        found[f"ssim/{step}"] = _sum_by_scene(errors.scenes, errors.ssim[:, column], moved)
+            found["error"] = _sum_by_scene(errors.scenes, levels[:, column], counted)
+        found[f"psnr/{step}"] = _sum_by_scene(errors.scenes, errors.psnr[:, column], counted)
+        found[f"ssim/{step}"] = _sum_by_scene(errors.scenes, errors.ssim[:, column], counted)
     found["gap"] = _sum_by_scene(errors.scenes, errors.psnr - errors.shuffled, errors.apart)
     found["gap/displacements"] = _sum_by_scene(errors.scenes, errors.psnr - errors.turned, errors.apart)
     return found
@@ -208,7 +201,7 @@ def tabulate_decisions(errors: DecisionErrors) -> Measures:
     }
 
 
-def measure_references(clips: HeldOutClips, decisions: Decisions) -> dict[str, dict[str, float]]:
+def measure_references(clips: PanoramaClips, decisions: Decisions) -> dict[str, dict[str, float]]:
     """Return the primary measures of a model that knows turns alone, and the regret of chance and of the oracle."""
     errors, _ = measure_clips(imagine_turns, clips)
     known = measure_decisions(imagine_turns, decisions).summarise()
@@ -220,13 +213,13 @@ def measure_references(clips: HeldOutClips, decisions: Decisions) -> dict[str, d
 
 
 def imagine_turns(
-    images: Frames, plans: NDArray[np.int8], seeds: NDArray[np.uint64], wanted: NDArray[np.int64]
+    observations: Conditioning, plans: NDArray[np.int8], seeds: NDArray[np.uint64], wanted: NDArray[np.int64]
 ) -> Frames:
     """Return the observation, turned as the agent turns: an `Imagine` that has learnt nothing."""
     from wiw import action
 
     azimuth = np.take_along_axis(action.to_trajectory(plans)[..., 2], wanted - 1, axis=1)
-    return turn_panoramas(np.repeat(images[:, None], wanted.shape[1], axis=1), azimuth)
+    return turn_panoramas(np.repeat(observations.image[:, None], wanted.shape[1], axis=1), azimuth)
 
 
 def average(table: dict[str, list[float]]) -> float:

@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
 """The worth of a model's imagination on stored decisions: which plan it chooses, and what the choice costs.
 
-A plan's score is how near what it leads to looks to the goal (PSNR). The oracle scores true pictures, a model the ones
-that it imagines.
+A plan's score is how near what it leads to looks to the goal (PSNR), seen with the heading that the plan ends with, in
+the view that the model has. The oracle scores true pictures, a model the ones that it imagines.
 """
 
 from __future__ import annotations
@@ -16,7 +16,11 @@ from numpy.typing import NDArray
 from wiw import action
 from wiw.datasets.decisions import Decisions
 from wiw.metrics import psnr, rank_agreement
-from wiw.training.held_out_clips import Frames, Imagine, turn_panoramas
+from wiw.training.held_out_clips import Frames, Imagine, ShownView
+from wiw.training.held_out_panoramas import WholePanorama
+from wiw.types import Conditioning
+
+PANORAMA = WholePanorama()
 
 
 @dataclass(frozen=True)
@@ -51,17 +55,28 @@ def measure_decisions(
     seed: int = 0,
     batch: int = 16,
     between: Callable[[], None] = lambda: None,
+    view: ShownView = PANORAMA,
 ) -> DecisionErrors:
-    """Let a model choose in stored decisions; `between` is called before each call of it.
+    """Let a model choose in stored decisions.
 
     Of plans with equal scores the first is chosen; their order in a decision is random.
+
+    Args:
+        imagine: the model.
+        decisions: to choose in.
+        seed: of what it draws.
+        batch: plans in one call.
+        between: called before each call.
+        view: that the model sees and imagines.
     """
     count, plans = decisions.plans.shape[:2]
-    scores = np.empty((count, plans))
+    scores, true = np.empty((count, plans)), np.empty((count, plans))
     for index in range(count):
-        ends = _imagine_ends(imagine, decisions, index, seed, batch, between)
-        scores[index] = _score(ends, decisions.goals[index])
-    true = np.stack([_score(decisions.futures[index], decisions.goals[index]) for index in range(count)])
+        headings = action.to_trajectory(decisions.plans[index])[:, -1, 2]
+        goals = view.show(np.repeat(decisions.goals[index][None], plans, axis=0), headings)
+        ends = _imagine_ends(imagine, decisions, index, seed, batch, between, view)
+        scores[index] = psnr(ends, goals, weights=view.weights)
+        true[index] = psnr(view.show(decisions.futures[index], headings), goals, weights=view.weights)
     least = decisions.distances.min(axis=1)
     rows = np.arange(count)
     return DecisionErrors(
@@ -74,20 +89,21 @@ def measure_decisions(
 
 
 def _imagine_ends(
-    imagine: Imagine, decisions: Decisions, index: int, seed: int, batch: int, between: Callable[[], None]
+    imagine: Imagine,
+    decisions: Decisions,
+    index: int,
+    seed: int,
+    batch: int,
+    between: Callable[[], None],
+    view: ShownView,
 ) -> Frames:
-    """Return the imagined ends of a decision's plans, uint8 [M, H, W, 3], facing where the observation does."""
+    """Return the imagined ends of a decision's plans, uint8 [M, H, W, 3], as the agent sees them there."""
     plans, lengths = decisions.plans[index], decisions.lengths[index]
-    images = np.repeat(decisions.images[index][None], len(plans), axis=0)
+    images = np.repeat(view.show(decisions.images[index][None], np.zeros(1)), len(plans), axis=0)
     seeds = np.arange(len(plans), dtype=np.uint64) + np.uint64(seed + index * len(plans))
     parts = []
     for first in range(0, len(plans), batch):
         rows = slice(first, first + batch)
         between()
-        parts.append(imagine(images[rows], plans[rows], seeds[rows], lengths[rows, None])[:, 0])
-    headings = action.to_trajectory(plans)[:, -1, 2]
-    return turn_panoramas(np.concatenate(parts), -headings)
-
-
-def _score(ends: Frames, goal: Frames) -> NDArray[np.float64]:
-    return np.asarray(psnr(ends, np.broadcast_to(goal, ends.shape), weights="latitude"))
+        parts.append(imagine(Conditioning(images[rows]), plans[rows], seeds[rows], lengths[rows, None])[:, 0])
+    return np.concatenate(parts)

@@ -1,82 +1,145 @@
 # SPDX-License-Identifier: Apache-2.0
 """How near imagined frames are to the true ones of held-out clips, and whether they follow the actions.
 
-A turn on the spot rolls a panorama and shows nothing new, so frames from another place and frames after turns alone
-are counted apart. The *control gap* is the error under the actions of another clip less the error under the true ones.
-Most of it comes from headings; the *gap of displacements* is what is left once the frames imagined under the other
-actions are turned to the true heading. A model that knows nothing but turns has none.
+The *control gap* is the error under the actions of another clip less the error under the true ones. Which frames count,
+how they are compared and what is imagined under other actions differs between the kinds of clips: panoramas
+(`held_out_panoramas`), front views of an agent that moves (`held_out_front_views`) and of an arm
+(`held_out_demonstrations`).
 """
 
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Iterator, Sequence
+from abc import ABC, abstractmethod
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, ClassVar, Generic, TypeVar
 
 import cv2
 import numpy as np
 from numpy.typing import NDArray
 
 from wiw import action
-from wiw.datasets.navigation_segment import NavigationSegment
 from wiw.errors import ArgumentError
 from wiw.metrics import psnr, ssim
+from wiw.metrics.images import Weights
 from wiw.types import Conditioning, Control
 from wiw.world_models.base import WorldModel
 
 STEPS = (1, 4, 8, 14)
 """Numbers of actions after which frames are compared."""
 APART = 0.1
-"""Metres from which on two places are not the same; a step is 0.2 m."""
+"""Metres from which on two places of an agent are not the same; a step is 0.2 m."""
 
 Frames = NDArray[np.uint8]
-Imagine = Callable[[Frames, NDArray[np.int8], NDArray[np.uint64], NDArray[np.int64]], Frames]
-"""Maps observations [B, H, W, 3], plans of primitives [B, K], seeds [B] and numbers of actions [B, S] to the frames
-[B, S, H, W, 3] that follow so many actions of each plan."""
+Imagine = Callable[[Conditioning, NDArray[Any], NDArray[np.uint64], NDArray[np.int64]], Frames]
+"""Maps observations of B rows, plans, seeds [B] and numbers of actions [B, S] to the frames [B, S, H, W, 3] that follow
+so many actions of each plan. Plans are of primitives, int8 [B, K], or of gripper poses, float64 [B, K + 1, 7] with that
+of frame 0 in front."""
+
+
+class ShownView(ABC):
+    """A view of panoramas that a model of primitives sees and imagines."""
+
+    weights: ClassVar[Weights]
+    """Weights of the rows where two such views are compared."""
+
+    @abstractmethod
+    def show(self, panoramas: Frames, headings: NDArray[np.float64]) -> Frames:
+        """Return panoramas [N, H, W, 3] as the model sees them once the agent has turned left by `headings` [N]."""
 
 
 @dataclass(frozen=True)
-class HeldOutClips:
-    """N clips that no model is trained on."""
+class ClipErrors:
+    """Errors of imagined frames against what was seen: N clips at S numbers of actions."""
 
     scenes: tuple[str, ...]
     """[N]."""
+    steps: tuple[int, ...]
+    """[S]."""
+    psnr: NDArray[np.float64]
+    """float64 [N, S] dB."""
+    ssim: NDArray[np.float64]
+    shuffled: NDArray[np.float64]
+    """float64 [N, S] dB: PSNR under the actions of another clip."""
+    counted: NDArray[np.bool_]
+    """bool [N, S]: whether the frame shows what a model has to imagine."""
+    apart: NDArray[np.bool_]
+    """bool [N, S]: whether it does, and the other actions lead to something else."""
+
+    def summarise(self) -> dict[str, float]:
+        """Return means by name: "psnr" over all steps, "psnr/4" and "ssim/4" after 4 actions, of the frames that are
+        counted; "gap" in dB of those that are apart. Those without a frame are left out.
+        """
+        found = {"psnr": take_mean(self.psnr, self.counted)}
+        for column, step in enumerate(self.steps):
+            found[f"psnr/{step}"] = take_mean(self.psnr[:, column], self.counted[:, column])
+            found[f"ssim/{step}"] = take_mean(self.ssim[:, column], self.counted[:, column])
+        found["gap"] = take_mean(self.psnr - self.shuffled, self.apart)
+        return keep_finite(found)
+
+
+Errors = TypeVar("Errors", bound=ClipErrors)
+
+
+@dataclass(frozen=True)
+class HeldOutClips(ABC, Generic[Errors]):
+    """N clips that no model is trained on."""
+
+    scenes: tuple[str, ...]
+    """[N]: the scene, or the demonstration, of each."""
     frames: Frames
     """uint8 [N, 1 + S, H, W, 3]: the observation, and what is seen after each of `steps`."""
-    plans: NDArray[np.int8]
-    """int8 [N, K]: the actions."""
-    shuffled: NDArray[np.int8]
-    """int8 [N, K]: the actions of another clip; the same in another order where there is one clip alone."""
+    plans: NDArray[Any]
+    """[N, ...]: the actions, as `Imagine` takes them."""
+    shuffled: NDArray[Any]
+    """[N, ...]: the actions of another clip; the same in another order where there is one clip alone."""
     steps: tuple[int, ...]
-    """[S]: numbers of actions, ascending, at most K."""
+    """[S]: numbers of actions, ascending, at most those of a plan."""
 
     def __len__(self) -> int:
         return len(self.scenes)
 
+    @property
+    def view(self) -> ShownView | None:
+        """View in which models of such clips see stored decisions; None where no agent moves."""
+        return None
 
-def select_clips(
-    clips: Sequence[NavigationSegment], count: int, seed: int, size: tuple[int, int], steps: Sequence[int] = STEPS
-) -> HeldOutClips:
-    """Select clips at random, the same ones for a seed, and decode the frames that are compared.
+    def observe(self, rows: slice) -> Conditioning:
+        """Return what a model is shown of some clips."""
+        return Conditioning(self.frames[rows, 0])
 
-    Args:
-        clips: windows of one length, such as `NavigationData(folder, "held-out").clips(14)`.
-        count: how many; all where there are fewer.
-        seed: of the choice.
-        size: (height, width) that frames are brought to.
-        steps: numbers of actions; longer ones than a clip are replaced by its last frame.
+    @abstractmethod
+    def compare(self, own: Frames, other: Frames) -> Errors:
+        """Compare frames [N, S, H, W, 3] imagined under the true actions, and under the other ones, with the truth."""
 
-    Raises:
-        ArgumentError: clips of a single frame.
-        FileError: a picture is damaged.
-    """
+
+def take_mean(values: NDArray[Any], chosen: NDArray[np.bool_]) -> float:
+    """Return the mean of the chosen values; NaN where there are none."""
+    return float(values[chosen].mean()) if chosen.any() else math.nan
+
+
+def keep_finite(found: Mapping[str, float]) -> dict[str, float]:
+    """Return the measures that are finite."""
+    return {name: value for name, value in found.items() if math.isfinite(value)}
+
+
+def measure_frames(clips: HeldOutClips[Any], own: Frames, other: Frames, weights: Weights) -> dict[str, Any]:
+    """Return the fields of `ClipErrors` that pictures alone decide on: names, steps, and all errors."""
+    truth = clips.frames[:, 1:]
+    return {
+        "scenes": clips.scenes,
+        "steps": clips.steps,
+        "psnr": np.asarray(psnr(own, truth, weights=weights)),
+        "ssim": np.asarray(ssim(own, truth, weights=weights)),
+        "shuffled": np.asarray(psnr(other, truth, weights=weights)),
+    }
+
+
+def draw_order(total: int, count: int, seed: int) -> tuple[NDArray[np.int64], np.random.Generator]:
+    """Return at most `count` of `total` clips at random, int64 [N], and a generator for the rest, both by a seed."""
     rng = np.random.default_rng((seed, 0x4E1D))
-    chosen = [clips[int(index)] for index in rng.permutation(len(clips))[:count]]
-    plans = np.stack([clip.actions[1:] for clip in chosen])
-    frames = np.stack([resize_frames(clip.images[[0, *fit_steps(steps, plans.shape[1])]], size) for clip in chosen])
-    scenes = tuple(clip.scene for clip in chosen)
-    return HeldOutClips(scenes, frames, plans, shuffle_plans(plans, rng), fit_steps(steps, plans.shape[1]))
+    return rng.permutation(total)[:count], rng
 
 
 def fit_steps(steps: Sequence[int], actions: int) -> tuple[int, ...]:
@@ -90,14 +153,19 @@ def fit_steps(steps: Sequence[int], actions: int) -> tuple[int, ...]:
     return tuple(sorted({min(step, actions) for step in steps}))
 
 
+def pair_clips(count: int, rng: np.random.Generator) -> NDArray[np.int64]:
+    """Return another clip for each, int64 [count], no clip twice; of a single one, itself."""
+    order = rng.permutation(count)
+    others = np.empty(count, np.int64)
+    others[order] = np.roll(order, 1)
+    return others
+
+
 def shuffle_plans(plans: NDArray[np.int8], rng: np.random.Generator) -> NDArray[np.int8]:
     """Return plans [N, K] such that each row has the actions of another row; of a single row, in another order."""
     if len(plans) == 1:
         return rng.permuted(plans, axis=1)
-    order = rng.permutation(len(plans))
-    shuffled = np.empty_like(plans)
-    shuffled[order] = plans[np.roll(order, 1)]
-    return shuffled
+    return plans[pair_clips(len(plans), rng)]
 
 
 def resize_frames(frames: Frames, size: tuple[int, int]) -> Frames:
@@ -107,43 +175,13 @@ def resize_frames(frames: Frames, size: tuple[int, int]) -> Frames:
     return np.stack([cv2.resize(frame, size[::-1], interpolation=cv2.INTER_AREA) for frame in frames]).astype(np.uint8)
 
 
-@dataclass(frozen=True)
-class ClipErrors:
-    """Errors of imagined frames against what was seen: N clips at S numbers of actions."""
-
-    scenes: tuple[str, ...]
-    """[N]."""
-    steps: tuple[int, ...]
-    """[S]."""
-    psnr: NDArray[np.float64]
-    """float64 [N, S] dB, rows weighted by the cosine of their latitude; so are all of these."""
-    ssim: NDArray[np.float64]
-    shuffled: NDArray[np.float64]
-    """float64 [N, S] dB: under the actions of another clip."""
-    turned: NDArray[np.float64]
-    """float64 [N, S] dB: the same frames, turned to the true heading."""
-    moved: NDArray[np.bool_]
-    """bool [N, S]: whether the true frame is from another place than the observation."""
-    apart: NDArray[np.bool_]
-    """bool [N, S]: whether it is so, and the other actions lead to yet another place."""
-
-    def summarise(self) -> dict[str, float]:
-        """Return means by name: "psnr" over all steps, "psnr/4" and "ssim/4" after 4 actions, of frames from another
-        place; "psnr/turns" of the rest; "gap" and "gap/displacements" in dB. Those without a frame are left out.
-        """
-        found = {"psnr": _mean(self.psnr, self.moved)}
-        for column, step in enumerate(self.steps):
-            found[f"psnr/{step}"] = _mean(self.psnr[:, column], self.moved[:, column])
-            found[f"ssim/{step}"] = _mean(self.ssim[:, column], self.moved[:, column])
-        found["psnr/turns"] = _mean(self.psnr, ~self.moved)
-        found["gap"] = _mean(self.psnr - self.shuffled, self.apart)
-        found["gap/displacements"] = _mean(self.psnr - self.turned, self.apart)
-        return {name: value for name, value in found.items() if math.isfinite(value)}
-
-
 def measure_clips(
-    imagine: Imagine, clips: HeldOutClips, seed: int = 0, batch: int = 16, between: Callable[[], None] = lambda: None
-) -> tuple[ClipErrors, tuple[Frames, Frames]]:
+    imagine: Imagine,
+    clips: HeldOutClips[Errors],
+    seed: int = 0,
+    batch: int = 16,
+    between: Callable[[], None] = lambda: None,
+) -> tuple[Errors, tuple[Frames, Frames]]:
     """Compare a model with held-out clips.
 
     Args:
@@ -158,60 +196,33 @@ def measure_clips(
     """
     parts: list[tuple[Frames, Frames]] = []
     for rows in _slice_batches(len(clips), batch):
-        images, seeds = clips.frames[rows, 0], np.arange(rows.start, rows.stop, dtype=np.uint64) + np.uint64(seed)
-        wanted = np.tile(np.array(clips.steps), (len(images), 1))
+        observations, seeds = clips.observe(rows), np.arange(rows.start, rows.stop, dtype=np.uint64) + np.uint64(seed)
+        wanted = np.tile(np.array(clips.steps), (len(observations), 1))
         made = []
         for plans in (clips.plans[rows], clips.shuffled[rows]):
             between()
-            made.append(imagine(images, plans, seeds, wanted))
+            made.append(imagine(observations, plans, seeds, wanted))
         parts.append((made[0], made[1]))
     own, other = (np.concatenate(frames) for frames in zip(*parts, strict=True))
-    return compare_frames(clips, own, other), (own, other)
-
-
-def compare_frames(clips: HeldOutClips, own: Frames, other: Frames) -> ClipErrors:
-    """Compare frames [N, S, H, W, 3] imagined under the true actions, and under the other ones, with the true ones."""
-    columns = np.array(clips.steps) - 1
-    paths, others = (action.to_trajectory(plans)[:, columns] for plans in (clips.plans, clips.shuffled))
-    moved = np.linalg.norm(paths[..., :2], axis=-1) > APART
-    truth = clips.frames[:, 1:]
-    turned = turn_panoramas(other, paths[..., 2] - others[..., 2])
-    return ClipErrors(
-        clips.scenes,
-        clips.steps,
-        _psnr(own, truth),
-        np.asarray(ssim(own, truth, weights="latitude")),
-        _psnr(other, truth),
-        _psnr(turned, truth),
-        moved,
-        moved & (np.linalg.norm(paths[..., :2] - others[..., :2], axis=-1) > APART),
-    )
-
-
-def turn_panoramas(frames: NDArray[Any], azimuth: NDArray[np.float64]) -> NDArray[Any]:
-    """Turn panoramas [..., H, W, C] left by azimuths [...] in radians, rounded to columns."""
-    width = frames.shape[-2]
-    columns = np.rint(azimuth / (2 * np.pi) * width).astype(np.int64)
-    sources = (np.arange(width) - columns[..., None]) % width
-    return np.take_along_axis(frames, sources[..., None, :, None], axis=-2)
+    return clips.compare(own, other), (own, other)
 
 
 def imagine_with(model: WorldModel) -> Imagine:
     """Return how a world model of primitives imagines; only the wanted frames are asked of causal models."""
 
     def imagine(
-        images: Frames, plans: NDArray[np.int8], seeds: NDArray[np.uint64], wanted: NDArray[np.int64]
+        observations: Conditioning, plans: NDArray[Any], seeds: NDArray[np.uint64], wanted: NDArray[np.int64]
     ) -> Frames:
         length = model.accepts.frames - 1 if model.accepts.frames else plans.shape[1]
         controls = [
             make_control(plan, length, int(own.max()), int(own.min()) - 1)
             for plan, own in zip(plans, wanted, strict=True)
         ]
-        rows = [
-            model.rollout(Conditioning(images[rows]), controls[rows], seeds[rows])
-            for rows in _slice_batches(len(images), model.accepts.best_batch)
+        parts = [
+            model.rollout(observations.rows(range(rows.start, rows.stop)), controls[rows], seeds[rows])
+            for rows in _slice_batches(len(controls), model.accepts.best_batch)
         ]
-        return np.concatenate(rows)[np.arange(len(images))[:, None], wanted]
+        return np.concatenate(parts)[np.arange(len(controls))[:, None], wanted]
 
     return imagine
 
@@ -226,11 +237,3 @@ def make_control(plan: NDArray[np.int8], length: int, own: int, shared: int = 0)
 def _slice_batches(count: int, batch: int) -> Iterator[slice]:
     for first in range(0, count, batch):
         yield slice(first, min(first + batch, count))
-
-
-def _psnr(frames: Frames, truth: Frames) -> NDArray[np.float64]:
-    return np.asarray(psnr(frames, truth, weights="latitude"))
-
-
-def _mean(values: NDArray[Any], chosen: NDArray[np.bool_]) -> float:
-    return float(values[chosen].mean()) if chosen.any() else math.nan

@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from wiw.networks import has_bfloat16
-from wiw.training.held_out_clips import turn_panoramas
+from wiw.training.held_out_panoramas import turn_panoramas
 from wiw.training.place_trainer import PlaceTrainer
 from wiw.training.pocket.batches import draw_places
 from wiw.training.post_training.recipe import ClipRecipe

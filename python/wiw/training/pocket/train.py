@@ -22,9 +22,16 @@ from wiw.training.pocket.trainer import PocketTrainer
 from wiw.training.post_training.clip_trainer import arrange_clips
 from wiw.training.post_training.corpora import NavigationCorpus, require_panoramas
 from wiw.training.post_training.stop_signals import SignalledCheckpoint
-from wiw.training.post_training.train import find_held_out, train_and_validate
-from wiw.training.post_training.validation import CARD, OnValidation, ValidatedTrainer, choose_validation_set
+from wiw.training.post_training.train import train_and_validate
+from wiw.training.post_training.validation import (
+    CARD,
+    OnValidation,
+    ValidatedTrainer,
+    build_validation_set,
+    find_held_out,
+)
 from wiw.training.reduced_frames import Bar, reduce_frames
+from wiw.types import Conditioning
 from wiw.world_models.pocket.model import Pocket
 from wiw.world_models.pocket.weights import load, save
 
@@ -76,13 +83,20 @@ def train_pocket(
         TrainingError: the loss is not finite; the last good state is kept, the message names the batch.
         FileError: the dataset is missing or damaged, or a file cannot be written.
     """
-    dataset = NavigationData(data, part, recipe.held_out)
-    corpus = NavigationCorpus(dataset, part)
-    require_panoramas("pocket", corpus)
+
+    def open_part(folder: str | Path, wanted: Part) -> NavigationCorpus:
+        found = NavigationCorpus(NavigationData(folder, wanted, recipe.held_out), wanted)
+        require_panoramas("pocket", found)
+        return found
+
+    corpus = open_part(data, part)
+    dataset = corpus.data
     clips = dataset.clips(recipe.frames)
     arrange_clips(len(clips), recipe)
-    split = find_held_out("pocket", corpus, validation, decisions, recipe)
-    checked = None if split is None else choose_validation_set(*split, decisions, recipe)
+    held_out, checked = find_held_out(open_part, corpus, validation, decisions, recipe), None
+    if held_out is not None:
+        chosen = held_out.select_clips(recipe.frames, recipe.validate_clips, recipe.seed, recipe.clip_size)
+        checked = build_validation_set(held_out, chosen, decisions, recipe)
     card: dict[str, Any] = {"wiw": wiw.__version__, "data": corpus.describe(), "recipe": recipe.describe()}
     card |= {"validated_on": checked.identity if checked else None}
     if (finished := _read_finished(out, card)) is not None:
@@ -112,12 +126,12 @@ def create_sampler(trainer: PocketTrainer) -> Imagine:
     trainer.network.train()
 
     def imagine_now(
-        images: Frames, plans: NDArray[np.int8], seeds: NDArray[np.uint64], wanted: NDArray[np.int64]
+        observations: Conditioning, plans: NDArray[Any], seeds: NDArray[np.uint64], wanted: NDArray[np.int64]
     ) -> Frames:
         with trainer.use_averages():
             trainer.network.eval()
             try:
-                return imagine(images, plans, seeds, wanted)
+                return imagine(observations, plans, seeds, wanted)
             finally:
                 trainer.network.train()
 

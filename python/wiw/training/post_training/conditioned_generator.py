@@ -4,23 +4,30 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from copy import deepcopy
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import torch
+from numpy.typing import NDArray
 from torch import Tensor, nn
 
 from wiw.errors import ArgumentError
+from wiw.training.held_out_clips import Frames, HeldOutClips, make_control
 from wiw.training.post_training import distributed
 from wiw.training.post_training.clips import ClipBatch
+from wiw.training.post_training.corpora import Corpus
 from wiw.training.post_training.objective import Objective
 from wiw.training.post_training.recipe import PostTrainingRecipe
 from wiw.training.post_training.trainable import Encoded, TrainableModel
+from wiw.types import Conditioning, Control
 from wiw.world_models.video.actions import checkpoint
 from wiw.world_models.video.actions.checkpoint import ADAPTER, supports_lora
+from wiw.world_models.video.actions.conditioning import ActionConditioning
 from wiw.world_models.video.actions.config import ActionConfig
 from wiw.world_models.video.actions.encoder import ActionEncoder
-from wiw.world_models.video.actions.injection import Injection, embedding_width
+from wiw.world_models.video.actions.injection import embedding_width
 from wiw.world_models.video.model import VideoModel
 
 LORA_LAYERS = ("to_q", "to_k", "to_v", "to_out.0", "ffn.net.0.proj", "ffn.net.2")
@@ -51,7 +58,7 @@ class ConditionedGenerator(TrainableModel):
         self.encoders = {place: ActionEncoder(config).to(self.device) for place in self.places}
         for place in self.places:
             prepare_denoiser(objective.pipeline, place, self.recipe)
-        self._injections = {place: Injection(self.find_denoiser(place)) for place in self.places}
+        self._conditioning = ActionConditioning(self.encoders, objective.pipeline, str(self.device))
         self._freeze_rest()
 
     def find_denoiser(self, place: str) -> Any:
@@ -85,9 +92,48 @@ class ConditionedGenerator(TrainableModel):
     def compute_losses(self, place: str, encoded: Encoded, actions: Tensor, random: torch.Generator) -> Tensor:
         """Return the denoiser's loss with each frame's action injected, or the null action in a share of the clips."""
         dropped = (torch.rand(len(actions), generator=random) < self.recipe.drop).to(self.device)
-        vectors = self.encoders[place](actions if self.action_ids is None else self.action_ids[actions], dropped)
-        with self._injections[place].inject(vectors):
+        vectors = self.encoders[place](self._identify_actions(actions), dropped)
+        with self._conditioning.injections[place].inject(vectors):
             return self.objective.compute_losses(place, self.objective.sample(encoded, random), random)
+
+    def list_networks(self) -> Sequence[nn.Module]:
+        """Return all networks of the pipeline that have weights."""
+        parts = [each for each in self.objective.pipeline.components.values() if isinstance(each, nn.Module)]
+        return [each for each in parts if next(each.parameters(), None) is not None]
+
+    def imagine(
+        self, observations: Conditioning, plans: NDArray[Any], seeds: NDArray[np.uint64], wanted: NDArray[np.int64]
+    ) -> Frames:
+        """Generate clips by the generator's own pipeline and sampler; see `TrainableModel.imagine`."""
+        generator, pipeline = self.objective.generator, self.objective.pipeline
+        controls = [self._make_control(plan, int(own.max())) for plan, own in zip(plans, wanted, strict=True)]
+        scheduler, clips = pipeline.scheduler, []
+        pipeline.scheduler = deepcopy(scheduler)
+        try:
+            for rows in generator.batches(len(controls)):
+                ids = torch.from_numpy(np.stack([np.asarray(control.ids) for control in controls[rows]]))
+                actions = self._identify_actions(ids.to(self.device)).cpu().numpy()
+                with self.objective.autocast(), self._conditioning.apply(actions):
+                    clips.append(generator.make_clips(observations.image[rows], controls[rows], seeds[rows]))
+        finally:
+            pipeline.scheduler = scheduler
+        frames = np.rint(np.concatenate(clips) * 255).astype(np.uint8)
+        return frames[np.arange(len(controls))[:, None], wanted]
+
+    def select_clips(self, held_out: Corpus) -> HeldOutClips[Any]:
+        """Select clips of the length that it is trained on; see `TrainableModel.select_clips`."""
+        recipe = self.recipe
+        return held_out.select_clips(recipe.frames, recipe.validate_clips, recipe.seed, recipe.clip_size)
+
+    def _identify_actions(self, actions: Tensor) -> Tensor:
+        """Return actions as the encoder takes them: its own ids of primitives [B, N], or poses [B, N, 7]."""
+        return actions if self.action_ids is None else self.action_ids[actions.long()]
+
+    def _make_control(self, plan: NDArray[Any], own: int) -> Control:
+        """Return primitives [K], of which `own` are wanted, or poses [K + 1, 7], at the generator's length."""
+        if self.action_ids is None:
+            return Control.of_poses(len(plan) - 1, ids=plan)
+        return make_control(plan, self.objective.generator.frames - 1, own)
 
     def write(self, folder: Path) -> None:
         """Write an action-conditioned checkpoint; see `wiw.world_models.video.actions.checkpoint`."""

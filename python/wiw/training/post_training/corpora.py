@@ -9,19 +9,24 @@ clip.images, clip.actions                 # uint8 [13, H, W, 3]; ids int8 [13], 
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from functools import cached_property
 from pathlib import Path
 from typing import Any, ClassVar, Literal
 
 import numpy as np
 from numpy.typing import NDArray
 
-from wiw import action, panorama
+from wiw import panorama
+from wiw.datasets.demonstration import Demonstration, Outline
 from wiw.datasets.demonstrations import Demonstrations, read_manifest
 from wiw.datasets.navigation import META, Clips, NavigationData, Part, part_of
 from wiw.datasets.parquet_files import MANIFEST
 from wiw.errors import ArgumentError, FileError
+from wiw.training.held_out_clips import HeldOutClips
+from wiw.training.held_out_demonstrations import DemonstratedPlan, select_demonstrations
+from wiw.training.held_out_panoramas import select_panoramas
 from wiw.types import GRIPPER_POSES, PRIMITIVES, View
 
 CorpusPart = Literal["train", "all"]
@@ -52,8 +57,20 @@ class Corpus(ABC):
 
     space: ClassVar[str]
     """Plan space of its actions, a name of `wiw.loop.plan_space`."""
+    unit: ClassVar[str]
+    """Noun for what is held out as a whole."""
+    command: ClassVar[str]
+    """Command that makes such folders."""
     view: View
     """View that its frames show."""
+    data: NavigationData | Demonstrations
+    part: Part
+    """Part of the data that it has."""
+
+    @property
+    @abstractmethod
+    def units(self) -> set[str]:
+        """Names of the scenes or demonstrations that it has."""
 
     @abstractmethod
     def clips(self, frames: int) -> CorpusClips:
@@ -64,16 +81,31 @@ class Corpus(ABC):
         """
 
     @abstractmethod
+    def select_clips(self, frames: int, count: int, seed: int, size: tuple[int, int]) -> HeldOutClips[Any]:
+        """Select clips that a model is measured on, which sees the corpus as it is.
+
+        Args:
+            frames: of a clip.
+            count: how many; all where there are fewer.
+            seed: of the choice.
+            size: (height, width) that frames are brought to.
+
+        Raises:
+            ArgumentError: there is none.
+            FileError: a picture is damaged.
+        """
+
+    @abstractmethod
     def describe(self) -> dict[str, Any]:
         """Return what identifies the corpus, as JSON values: a digest of its files, and which part of them."""
 
 
-def open_corpus(folder: str | Path, part: CorpusPart, held_out: float = 0.05) -> Corpus:
+def open_corpus(folder: str | Path, part: Part, held_out: float = 0.05) -> Corpus:
     """Open a folder of `wiw collect navigation` or `wiw collect manipulation`.
 
     Args:
         folder: as the command left it.
-        part: "train", which leaves a share for validation, or "all".
+        part: "train", which leaves a share for validation, "held-out", which is that share, or "all".
         held_out: share of the scenes, or of the demonstrations, that "train" leaves out.
 
     Raises:
@@ -110,6 +142,9 @@ class NavigationCorpus(Corpus):
     """
 
     space = PRIMITIVES
+    unit = "scene"
+    command = "wiw collect navigation"
+    data: NavigationData
 
     def __init__(self, data: NavigationData, part: Part, front: tuple[int, int] | None = None) -> None:
         self.data, self.part = data, part
@@ -121,9 +156,23 @@ class NavigationCorpus(Corpus):
         """Return the corpus with front views, which are cut out of panoramas where it has those."""
         return NavigationCorpus(self.data, self.part, size)
 
+    @property
+    def units(self) -> set[str]:
+        """Names of the scenes."""
+        return {row["scene"] for row in self.data.segments}
+
+    def cut_views(self, images: NDArray[np.uint8]) -> NDArray[np.uint8]:
+        """Return pictures [N, H, W, 3] of the dataset as the corpus shows them."""
+        return cut_front_views(images, self._crop) if self._crop else images
+
     def clips(self, frames: int) -> CorpusClips:
         """Return all windows of so many frames; see `Corpus.clips`."""
-        return NavigationClips(self.data.clips(frames), self._crop)
+        return NavigationClips(self.data.clips(frames), self.cut_views)
+
+    def select_clips(self, frames: int, count: int, seed: int, size: tuple[int, int]) -> HeldOutClips[Any]:
+        """Select clips of panoramas; see `Corpus.select_clips`."""
+        require_panoramas("validation", self)
+        return select_panoramas(self.data.clips(frames), count, seed, size)
 
     def describe(self) -> dict[str, Any]:
         """Return a digest of the files' checksums, which part, how many segments."""
@@ -131,10 +180,10 @@ class NavigationCorpus(Corpus):
 
 
 class NavigationClips(CorpusClips):
-    """Windows of navigation segments; `crop` is the size of front views that are cut out of panoramas."""
+    """Windows of navigation segments; `cut` maps pictures [N, H, W, 3] to views of the corpus."""
 
-    def __init__(self, clips: Clips, crop: tuple[int, int] | None) -> None:
-        self._clips, self._crop = clips, crop
+    def __init__(self, clips: Clips, cut: Callable[[NDArray[np.uint8]], NDArray[np.uint8]]) -> None:
+        self._clips, self._cut = clips, cut
 
     def __len__(self) -> int:
         return len(self._clips)
@@ -146,14 +195,16 @@ class NavigationClips(CorpusClips):
             FileError: a picture is damaged.
         """
         segment = self._clips[index]
-        images = segment.images
-        if self._crop:
-            images = np.asarray(panorama.to_perspective(images, HFOV_DEG, self._crop))
-        return Clip(images, segment.actions)
+        return Clip(self._cut(segment.images), segment.actions)
 
     def describe(self, index: int) -> str:
         """Return scene, segment and first frame."""
         return self._clips.describe(index)
+
+
+def cut_front_views(panoramas: NDArray[np.uint8], size: tuple[int, int]) -> NDArray[np.uint8]:
+    """Return front views of a size (height, width) out of panoramas [N, H, W, 3], as the loop cuts them."""
+    return np.asarray(panorama.to_perspective(panoramas, HFOV_DEG, size))
 
 
 def require_panoramas(name: str, corpus: Corpus) -> None:
@@ -177,35 +228,91 @@ class DemonstrationCorpus(Corpus):
     """
 
     space = GRIPPER_POSES
+    unit = "demonstration"
+    command = "wiw collect manipulation"
     view: View = "perspective"
+    data: Demonstrations
 
-    def __init__(self, data: Demonstrations, part: CorpusPart, held_out: float) -> None:
+    def __init__(self, data: Demonstrations, part: Part, held_out: float) -> None:
         self.data, self.part, self.held_out = data, part, held_out
+
+    @property
+    def units(self) -> set[str]:
+        """Names of the demonstrations, by task and seed of the table."""
+        return {name_demonstration(outline) for _, outline in self._outlines}
 
     def clips(self, frames: int) -> CorpusClips:
         """Return the clips of all plans of at most `frames` - 1 actions; see `Corpus.clips`."""
-        return DemonstrationClips(self.data, self.part, self.held_out, frames)
+        return DemonstrationClips(self._find_plans(frames))
+
+    def select_clips(self, frames: int, count: int, seed: int, size: tuple[int, int]) -> HeldOutClips[Any]:
+        """Select plans and their frames; see `Corpus.select_clips`."""
+        return select_demonstrations(self._find_plans(frames), count, seed, size)
+
+    def _find_plans(self, frames: int) -> DemonstratedPlans:
+        plans = DemonstratedPlans(self.data, self._outlines, frames)
+        if not plans:
+            raise ArgumentError(
+                f"{self.data.folder}: expected demonstrations with an action in the part '{self.part}', got none; "
+                "collect more"
+            )
+        return plans
+
+    @cached_property
+    def _outlines(self) -> list[tuple[int, Outline]]:
+        """Demonstrations of the part, each with its number in the dataset."""
+        outlines = enumerate(self.data.read_outlines())
+        return [each for each in outlines if self.part in ("all", part_of(name_demonstration(each[1]), self.held_out))]
 
     def describe(self) -> dict[str, Any]:
         """Return a digest of the manifest, of which demonstrations are a function, and which part of them it is."""
         return {"sha256": self.data.digest(), "part": self.part, "demonstrations": len(self.data), "view": self.view}
 
 
-class DemonstrationClips(CorpusClips):
-    """Plans within demonstrations: from the end of any action, or the start, to the end of a later one."""
+class DemonstratedPlans(Sequence[DemonstratedPlan]):
+    """Plans within demonstrations: from the end of any action, or the start, to the end of a later one.
 
-    def __init__(self, data: Demonstrations, part: CorpusPart, held_out: float, frames: int) -> None:
+    Args:
+        data: the demonstrations.
+        outlines: of those whose plans are listed, each with its number in `data`.
+        frames: spread evenly over each plan.
+    """
+
+    def __init__(self, data: Demonstrations, outlines: Sequence[tuple[int, Outline]], frames: int) -> None:
         self._data, self._frames = data, frames
         self._plans = [
-            (index, first, last)
-            for index, outline in enumerate(data.read_outlines())
-            if part == "all" or part == part_of(f"{outline.task} {outline.seed}", held_out)
+            (number, first, last)
+            for number, outline in outlines
             for first, last in _list_plans(outline.ended, frames - 1)
         ]
-        if not self._plans:
-            raise ArgumentError(
-                f"{data.folder}: expected demonstrations with an action in the part '{part}', got none; collect more"
-            )
+
+    def __len__(self) -> int:
+        return len(self._plans)
+
+    def __getitem__(self, index: Any) -> Any:
+        """Return a plan.
+
+        Raises:
+            FileError: a picture is damaged.
+        """
+        number, first, last = self._plans[index]
+        demonstration = self._data[number]
+        ends = find_ends(demonstration.ended)[first : last + 1]
+        images = demonstration.decode(spread_frames(ends, self._frames))
+        name = name_demonstration(demonstration)
+        return DemonstratedPlan(name, images, demonstration.poses[ends[0]], demonstration.actions[ends[1:]])
+
+    def describe(self, index: int) -> str:
+        """Return task, demonstration and actions."""
+        number, first, last = self._plans[index]
+        return f"clip {index} (demonstration {number} of the dataset, actions {first + 1} to {last})"
+
+
+class DemonstrationClips(CorpusClips):
+    """Plans within demonstrations as clips: their frames, and a pose for each."""
+
+    def __init__(self, plans: DemonstratedPlans) -> None:
+        self._plans = plans
 
     def __len__(self) -> int:
         return len(self._plans)
@@ -216,18 +323,17 @@ class DemonstrationClips(CorpusClips):
         Raises:
             FileError: a picture is damaged.
         """
-        number, first, last = self._plans[index]
-        demonstration = self._data[number]
-        ends = find_ends(demonstration.ended)[first : last + 1]
-        shown = spread_frames(ends, self._frames)
-        start, plan = demonstration.poses[ends[0]], demonstration.actions[ends[1:]]
-        poses = action.resample(plan, self._frames - 1, start=start)
-        return Clip(demonstration.decode(shown), np.concatenate([start[None], poses]))
+        plan = self._plans[index]
+        return Clip(plan.images, plan.spread(plan.targets))
 
     def describe(self, index: int) -> str:
         """Return task, demonstration and actions."""
-        number, first, last = self._plans[index]
-        return f"clip {index} (demonstration {number} of the dataset, actions {first + 1} to {last})"
+        return self._plans.describe(index)
+
+
+def name_demonstration(outline: Outline | Demonstration) -> str:
+    """Return the name by which a demonstration is held out: its task and the seed of its table."""
+    return f"{outline.task} {outline.seed}"
 
 
 def _list_plans(ended: NDArray[np.bool_], longest: int) -> list[tuple[int, int]]:

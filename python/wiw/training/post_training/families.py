@@ -157,7 +157,7 @@ class NWMFamily(Family):
         path = weights.fetch(source.resolve_folder() or NWM.weights, NWM.file, source.revision)
         network, codec = weights.load_cdit(path), weights.load_codec(weights.codec_beside(path), None)
         identity = {"digest": weights.digest(network, codec)}
-        model = TrainableNWM(network, codec, recipe, NWM.spacing, devices.device(source.device))
+        model = TrainableNWM(network, codec, recipe, NWM.spacing, NWM.steps, devices.device(source.device))
         return Loaded(model, recipe, identity)
 
 

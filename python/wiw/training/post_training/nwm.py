@@ -10,18 +10,24 @@ from typing import Any
 
 import numpy as np
 import torch
+from numpy.typing import NDArray
 from torch import Tensor, nn
 from torch.nn.functional import mse_loss
 
 from wiw import action
 from wiw.errors import ArgumentError
+from wiw.training.held_out_clips import STEPS, Frames, imagine_with
+from wiw.training.held_out_front_views import FrontView, FrontViewClips, select_front_views
 from wiw.training.post_training.clips import ClipBatch
+from wiw.training.post_training.corpora import Corpus, NavigationCorpus
 from wiw.training.post_training.recipe import PostTrainingRecipe
 from wiw.training.post_training.trainable import Encoded, TrainableModel
+from wiw.types import Conditioning
 from wiw.world_models.nwm import weights
 from wiw.world_models.nwm.cdit import CDiT
 from wiw.world_models.nwm.diffusion import TIMES, scheduler
-from wiw.world_models.nwm.images import to_network
+from wiw.world_models.nwm.images import rows_seen, to_network
+from wiw.world_models.nwm.model import NWM
 from wiw.world_models.nwm.motion import SHIFT, normalise_steps
 
 PLACE = "cdit"
@@ -39,6 +45,7 @@ class TrainableNWM(TrainableModel):
         codec: the autoencoder of images.
         recipe: of the training.
         spacing: metres between waypoints, as the world model's option.
+        steps: of diffusion for each frame that is imagined, as the world model's option.
         device: of torch.
 
     Raises:
@@ -47,13 +54,17 @@ class TrainableNWM(TrainableModel):
 
     places = (PLACE,)
 
-    def __init__(self, network: CDiT, codec: Any, recipe: PostTrainingRecipe, spacing: float, device: str) -> None:
+    def __init__(
+        self, network: CDiT, codec: Any, recipe: PostTrainingRecipe, spacing: float, steps: int, device: str
+    ) -> None:
         self.device, self.recipe, self.spacing = torch.device(device), recipe, spacing
         self.network, self.codec = network.to(self.device), codec.to(self.device)
         _check_recipe(recipe, network.size.context)
         self.network.requires_grad_(True).train()
         self.network.checkpointing = recipe.checkpointing
         self._diffusion = VariationalDiffusion()
+        options = {"spacing": spacing, "steps": steps, "device": device, "precision": recipe.precision}
+        self._imagine = imagine_with(NWM.with_networks(self.network, self.codec, **options))
 
     def list_trained(self, place: str) -> dict[str, nn.Parameter]:
         """Return the parameters of the CDiT."""
@@ -104,6 +115,30 @@ class TrainableNWM(TrainableModel):
 
     def activate(self, place: str) -> None:
         """Do nothing: the one network stays on the device."""
+
+    def list_networks(self) -> Sequence[nn.Module]:
+        """Return the CDiT and the codec."""
+        return [self.network, self.codec]
+
+    def imagine(
+        self, observations: Conditioning, plans: NDArray[Any], seeds: NDArray[np.uint64], wanted: NDArray[np.int64]
+    ) -> Frames:
+        """Imagine frame after frame, as the world model does; see `TrainableModel.imagine`."""
+        return self._imagine(observations, plans, seeds, wanted)
+
+    def select_clips(self, held_out: Corpus) -> FrontViewClips:
+        """Select clips of the context and the actions after it, 14 where segments are that long.
+
+        Frames are the part of the front view that the network sees, which is also all that it imagines.
+        """
+        assert isinstance(held_out, NavigationCorpus), "the family trains on no other"
+        context, size = self.network.size.context, self.recipe.clip_size
+        longest = max((row["frames"] for row in held_out.data.segments), default=0)
+        clips = held_out.data.clips(max(context + 1, min(context + max(STEPS), longest)))
+        view = FrontView(size, rows_seen(*size))
+        return select_front_views(
+            clips, held_out.cut_views, view, context, self.recipe.validate_clips, self.recipe.seed
+        )
 
     def write(self, folder: Path) -> None:
         """Write network and codec, as `wiw.world_model("nwm", weights=folder)` reads them."""

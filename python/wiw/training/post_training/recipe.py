@@ -52,7 +52,7 @@ class ClipRecipe(ABC):
     """Precision of matrix products and of frozen weights; trained weights are float32."""
     seed: int = 0
     held_out: float = 0.05
-    """Share of the scenes, chosen by a hash of their names, that are left out of training, for validation."""
+    """Share of the scenes or demonstrations, chosen by a hash of their names, that are left out for validation."""
     validate_every: int | None = 500
     """Steps between two validations; none if None."""
     validate_clips: int = 8

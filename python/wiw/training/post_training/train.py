@@ -7,17 +7,18 @@ import json
 import shutil
 from collections.abc import Callable, Mapping
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 from typing import Any
 
 import wiw
-from wiw.datasets.navigation import NavigationData
+from wiw.datasets.navigation import Part
 from wiw.errors import ArgumentError, FileError, TrainingError
 from wiw.files import atomic_file, atomic_folder
 from wiw.training.held_out_clips import Imagine
 from wiw.training.post_training import distributed
 from wiw.training.post_training.clip_trainer import ClipTrainer, arrange_clips
-from wiw.training.post_training.corpora import Corpus, CorpusPart, NavigationCorpus, open_corpus
+from wiw.training.post_training.corpora import Corpus, CorpusPart, open_corpus
 from wiw.training.post_training.families import Family, Loaded, PretrainedWeights, find_family
 from wiw.training.post_training.latent_cache import LatentCache
 from wiw.training.post_training.recipe import ClipRecipe, PostTrainingRecipe, load_recipe
@@ -31,7 +32,8 @@ from wiw.training.post_training.validation import (
     OnValidation,
     ValidatedTrainer,
     ValidationSet,
-    choose_validation_set,
+    build_validation_set,
+    find_held_out,
 )
 from wiw.training.trainer import run_training
 from wiw.types import GRIPPER_POSES, PRIMITIVES
@@ -82,8 +84,8 @@ def post_train(
         device: of torch; "cuda" where there is one, else "cpu".
         recipe: the numbers; the shipped recipe if None, in float32 where there is no GPU.
         part: of the data: "train", which leaves a share of scenes or demonstrations for validation, or "all".
-        validation: folder of another dataset whose clips it is validated on; the scenes left out if None. With all
-            scenes in training and no other dataset, there is no validation, and the checkpoint has the last weights.
+        validation: folder of another dataset whose clips it is validated on; what is left out if None. With all of the
+            data in training and no other dataset, there is no validation, and the checkpoint has the last weights.
         decisions: file of `wiw collect decisions`, for the rank agreement with the oracle.
         tracker: "trackio", "wandb" or "tensorboard", told what the log is.
         cache: folder where encoded clips are kept, for later epochs and other trainings on the same data; none if None.
@@ -96,8 +98,8 @@ def post_train(
 
     Raises:
         ArgumentError: a model that is not trained here or not on such data, too few clips, a recipe that the model
-            cannot have, a state of a training with other data or numbers, or validation that the model does not have,
-            on scenes that are trained on or not there.
+            cannot have, a state of a training with other data or numbers, or validation on what is trained on, not
+            there, or of another kind.
         TrainingError: the loss is not finite; the last good state is kept, the message names the batch.
         FileError: `out` holds something, or the dataset is missing or damaged.
         WeightsError, DependencyError, DeviceMemoryError: see the world model.
@@ -109,12 +111,14 @@ def post_train(
     _require_free(out)
     corpus, recipe = family.fit(open_corpus(data, part, recipe.held_out), recipe)
     arrange_clips(len(corpus.clips(recipe.frames)), recipe)
-    split = find_held_out(name, corpus, validation, decisions, recipe)
+    held_out = find_held_out(partial(open_part, family, recipe), corpus, validation, decisions, recipe)
     source = PretrainedWeights(None if weights is None else str(weights), revision, variant, device)
     with devices.memory_guard(f"training {name} on {device}", "; ".join(list_remedies(recipe))):
         loaded = family.load(corpus, recipe, source)
         recipe = loaded.recipe
-        checked = None if split is None else choose_validation_set(*split, decisions, recipe)
+        checked = None
+        if held_out is not None:
+            checked = build_validation_set(held_out, loaded.model.select_clips(held_out), decisions, recipe)
         card = {"model": name, **describe_training(loaded, corpus)}
         card |= {"validated_on": checked.identity if checked else None}
         state = open_state(out, card, seconds)
@@ -138,34 +142,13 @@ def post_train(
     return card
 
 
-def find_held_out(
-    name: str,
-    corpus: Corpus,
-    validation: str | Path | None,
-    decisions: str | Path | None,
-    recipe: ClipRecipe,
-) -> tuple[NavigationData, NavigationData] | None:
-    """Return what is trained on, and what it is validated on: another dataset, or the scenes that it leaves out.
-
-    None where there is no validation.
+def open_part(family: Family, recipe: PostTrainingRecipe, folder: str | Path, part: Part) -> Corpus:
+    """Open a part of a dataset in the views that a model sees.
 
     Raises:
-        ArgumentError: validation is asked for, of a model that does not follow primitives in panoramas.
+        ArgumentError, FileError, DependencyError: see `Family.fit` and `open_corpus`.
     """
-    if not isinstance(corpus, NavigationCorpus) or corpus.view != "panorama":
-        if validation is not None or decisions is not None:
-            raise ArgumentError(
-                f"{name}: only models that follow primitives in panoramas are validated while they train; leave "
-                "validation and decisions out"
-            )
-        return None
-    if recipe.validate_every is None:
-        return None
-    if validation is not None:
-        return corpus.data, NavigationData(validation)
-    if corpus.part != "train":
-        return None
-    return corpus.data, NavigationData(corpus.data.folder, "held-out", recipe.held_out)
+    return family.fit(open_corpus(folder, part, recipe.held_out), recipe)[0]
 
 
 def train_and_validate(

@@ -8,10 +8,15 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import torch
+from numpy.typing import NDArray
 from torch import Tensor, nn
 
+from wiw.training.held_out_clips import Frames, HeldOutClips
 from wiw.training.post_training.clips import ClipBatch
+from wiw.training.post_training.corpora import Corpus
+from wiw.types import Conditioning
 
 Encoded = Mapping[str, Tensor]
 """Clips as the networks see them, a row a clip."""
@@ -49,6 +54,28 @@ class TrainableModel(ABC):
             encoded: what `encode` returned.
             actions: int64 [B, N] or float64 [B, N, 7], as in `ClipBatch`.
             random: on the CPU, so that draws are the same on all devices.
+        """
+
+    @abstractmethod
+    def list_networks(self) -> Sequence[nn.Module]:
+        """Return all networks that imagine, those that are not trained as well."""
+
+    @abstractmethod
+    def imagine(
+        self, observations: Conditioning, plans: NDArray[Any], seeds: NDArray[np.uint64], wanted: NDArray[np.int64]
+    ) -> Frames:
+        """Imagine as the world model does, with the networks as they are; see `wiw.training.held_out_clips.Imagine`.
+
+        They are in evaluation mode and on the device.
+        """
+
+    @abstractmethod
+    def select_clips(self, held_out: Corpus) -> HeldOutClips[Any]:
+        """Select the clips that it is validated on, as many as the recipe says, with all that it is shown of them.
+
+        Raises:
+            ArgumentError: there is none.
+            FileError: a picture is damaged.
         """
 
     @abstractmethod

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Validation while training: every so many steps on scenes that are held out; the best weights are kept by it."""
+"""Validation while training: every so many steps on what is held out of it; the best weights are kept by it."""
 
 from __future__ import annotations
 
@@ -14,21 +14,23 @@ import numpy as np
 from numpy.typing import NDArray
 
 from wiw.datasets.decisions import Decisions, digest_decisions, load_decisions
-from wiw.datasets.navigation import NavigationData
+from wiw.datasets.navigation import Part
 from wiw.errors import ArgumentError
 from wiw.files import atomic_file
 from wiw.training.checkpoint import ResumableTrainer
 from wiw.training.decision_errors import measure_decisions
-from wiw.training.held_out_clips import Frames, HeldOutClips, Imagine, measure_clips, resize_frames, select_clips
+from wiw.training.held_out_clips import Frames, HeldOutClips, Imagine, ShownView, measure_clips
 from wiw.training.post_training import distributed
 from wiw.training.post_training.clip_trainer import ClipTrainer
+from wiw.training.post_training.corpora import Corpus
 from wiw.training.post_training.recipe import ClipRecipe
 from wiw.training.post_training.training_log import TrainingLog
+from wiw.types import PRIMITIVES
 
 CARD = "training.json"
 """Name of the file beside the weights that says on what and how they were trained."""
 CRITERION = "psnr"
-"""Measure that the best weights have the most of: mean PSNR of frames from another place than the observation."""
+"""Measure that the best weights have the most of: mean PSNR of the frames that count."""
 PREFIX = "validation/"
 SHOWN = 4
 """Clips in a picture."""
@@ -43,8 +45,9 @@ OnValidation = Callable[[int, Mapping[str, float]], None]
 class ValidationSet:
     """Clips and decisions that a model in training is measured on."""
 
-    clips: HeldOutClips
-    decisions: Decisions | None
+    clips: HeldOutClips[Any]
+    decisions: tuple[Decisions, ShownView] | None
+    """With the view that the model sees of them."""
     every: int
     """Steps between two validations."""
     identity: Mapping[str, Any]
@@ -55,56 +58,90 @@ class ValidationSet:
         errors, (own, other) = measure_clips(imagine, self.clips, seed, between=between)
         found = errors.summarise()
         if self.decisions is not None:
-            found |= measure_decisions(imagine, self.decisions, seed, between=between).summarise()
+            decisions, view = self.decisions
+            found |= measure_decisions(imagine, decisions, seed, between=between, view=view).summarise()
         return found, draw_sheet(self.clips, own, other)
 
 
-def choose_validation_set(
-    data: NavigationData, held_out: NavigationData, decisions: str | Path | None, recipe: ClipRecipe
-) -> ValidationSet:
-    """Return the clips of held-out scenes that a training is validated on, and stored decisions, if any.
+OpenPart = Callable[[str | Path, Part], Corpus]
+"""Opens a part of a dataset in the views that the model in training sees."""
+
+
+def find_held_out(
+    open_part: OpenPart,
+    corpus: Corpus,
+    validation: str | Path | None,
+    decisions: str | Path | None,
+    recipe: ClipRecipe,
+) -> Corpus | None:
+    """Return what a training is validated on: another dataset, or the part that its own leaves out for it.
+
+    None where there is no validation.
 
     Args:
-        data: what is trained on.
-        held_out: the scenes that are not.
+        open_part: opens either.
+        corpus: that is trained on.
+        validation: folder of the other dataset.
         decisions: file of `wiw collect decisions`.
-        recipe: of the training: size and number of clips.
+        recipe: of the training.
 
     Raises:
-        ArgumentError: a scene is in both, there is none held out, or decisions are longer than a clip.
-        FileError: a picture or the file of decisions is damaged.
+        ArgumentError: another kind of dataset, nothing is held out, something is in both, or decisions for an arm.
+        FileError: the dataset is missing or damaged.
     """
-    scenes, trained = ({row["scene"] for row in each.segments} for each in (held_out, data))
-    if scenes & trained:
+    if recipe.validate_every is None or (validation is None and corpus.part != "train"):
+        return None
+    held_out = open_part(corpus.data.folder, "held-out") if validation is None else open_part(validation, "all")
+    if held_out.space != corpus.space:
         raise ArgumentError(
-            f"validation: expected scenes that are not trained on, got {', '.join(sorted(scenes & trained)[:3])}"
+            f"validation: expected a dataset of `{corpus.command}`, as that of the training is, but "
+            f"{held_out.data.folder} is of `{held_out.command}`"
         )
-    if not scenes:
+    if decisions is not None and corpus.space != PRIMITIVES:
+        raise ArgumentError("decisions: those of `wiw collect decisions` are an agent's that moves; leave them out")
+    names, trained = held_out.units, corpus.units
+    if names & trained:
         raise ArgumentError(
-            f"validation: no scene of {held_out.folder} is held out; collect more scenes, raise held_out in the "
-            "recipe, give another dataset by --validation, or train without (--option validate_every=null)"
+            f"validation: expected {corpus.unit}s that are not trained on, got {', '.join(sorted(names & trained)[:3])}"
         )
-    stored = None if decisions is None else load_decisions(decisions)
-    if stored is not None:
-        if stored.plans.shape[-1] > recipe.frames - 1:
-            raise ArgumentError(
-                f"{decisions}: expected plans of at most {recipe.frames - 1} actions, those of a clip, got "
-                f"{stored.plans.shape[-1]}; collect others with --actions {recipe.frames - 1}"
-            )
-        stored = resize_decisions(stored, recipe.clip_size)
-    clips = select_clips(held_out.clips(recipe.frames), recipe.validate_clips, recipe.seed, recipe.clip_size)
-    identity: dict[str, Any] = {"data": held_out.digest(), "scenes": sorted(set(clips.scenes))}
+    if not names:
+        raise ArgumentError(
+            f"validation: no {corpus.unit} of {held_out.data.folder} is held out; collect more {corpus.unit}s, raise "
+            "held_out in the recipe, give another dataset by --validation, or train without (--option "
+            "validate_every=null)"
+        )
+    return held_out
+
+
+def build_validation_set(
+    held_out: Corpus, clips: HeldOutClips[Any], decisions: str | Path | None, recipe: ClipRecipe
+) -> ValidationSet:
+    """Return what a training is validated on: clips that are held out, and stored decisions, if any.
+
+    Args:
+        held_out: corpus of the clips.
+        clips: selected for the model.
+        decisions: file of `wiw collect decisions`.
+        recipe: of the training.
+
+    Raises:
+        ArgumentError: decisions are longer than a clip.
+        FileError: the file of decisions is damaged.
+    """
+    identity: dict[str, Any] = {"data": held_out.data.digest(), f"{held_out.unit}s": sorted(set(clips.scenes))}
+    stored = None
     if decisions is not None:
+        assert clips.view is not None, "find_held_out"
+        stored = load_decisions(decisions), clips.view
+        longest, actions = stored[0].plans.shape[-1], clips.plans.shape[1]
+        if longest > actions:
+            raise ArgumentError(
+                f"{decisions}: expected plans of at most {actions} actions, those of a clip, got {longest}; collect "
+                f"others with --actions {actions}"
+            )
         identity["decisions"] = digest_decisions(decisions)
     assert recipe.validate_every, "asked for"
     return ValidationSet(clips, stored, recipe.validate_every, identity)
-
-
-def resize_decisions(decisions: Decisions, size: tuple[int, int]) -> Decisions:
-    """Return decisions with pictures of another size (height, width)."""
-    futures = np.stack([resize_frames(each, size) for each in decisions.futures])
-    images, goals = resize_frames(decisions.images, size), resize_frames(decisions.goals, size)
-    return Decisions(decisions.scenes, images, goals, decisions.plans, futures, decisions.distances)
 
 
 class ValidatedTrainer(ResumableTrainer):
@@ -210,7 +247,7 @@ class ValidatedTrainer(ResumableTrainer):
         return float(json.loads(card.read_text(encoding="utf-8"))["validation"][CRITERION])
 
 
-def draw_sheet(clips: HeldOutClips, own: Frames, other: Frames) -> NDArray[np.uint8]:
+def draw_sheet(clips: HeldOutClips[Any], own: Frames, other: Frames) -> NDArray[np.uint8]:
     """Return a picture, uint8 [H, W, 3], of the first clips: three rows each.
 
     What was seen, what is imagined under the true actions, and under those of another clip; the first column is the

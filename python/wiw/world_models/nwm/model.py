@@ -22,6 +22,8 @@ from wiw.world_models.video.loading import versions
 if TYPE_CHECKING:
     from torch import Tensor
 
+    from wiw.world_models.nwm.cdit import CDiT
+
 HUB = "facebook/nwm"
 
 
@@ -88,15 +90,30 @@ class NWM(WorldModel):
         self.precision = self.precision or ("float32" if self.device == "cpu" else "bfloat16")
         import torch
 
-        from wiw.world_models.nwm import weights
-
         self._place = torch.device(self.device)
         with devices.memory_guard("NWM", "its weights take about 4.5 GB; free the GPU of other programs"):
-            path = weights.fetch(self.weights, self.file, self.revision)
-            self._network = weights.load_cdit(path).to(self._place)
-            self._codec = weights.load_codec(self.vae or weights.codec_beside(path), self.vae_revision).to(self._place)
+            self._network, self._codec = self._load_networks()
         self.accepts = replace(self.accepts, history=self._network.size.context)
         self._side = self._network.size.latent_side * 2 ** (len(self._codec.config.block_out_channels) - 1)
+
+    @classmethod
+    def with_networks(cls, network: CDiT, codec: Any, **options: Any) -> NWM:
+        """Make the model of a network and a codec that lie on the device, instead of those in a folder.
+
+        A pickle of it does not have these networks.
+        """
+        model = cls.__new__(cls)
+        model._load_networks = lambda: (network, codec)  # type: ignore[method-assign]
+        cls.__init__(model, **options)
+        return model
+
+    def _load_networks(self) -> tuple[CDiT, Any]:
+        """Return the network and the codec, on the device."""
+        from wiw.world_models.nwm import weights
+
+        path = weights.fetch(self.weights, self.file, self.revision)
+        codec = weights.load_codec(self.vae or weights.codec_beside(path), self.vae_revision)
+        return weights.load_cdit(path).to(self._place), codec.to(self._place)
 
     def describe(self) -> dict[str, Any]:
         """Return options, what tells the weights from others, and the versions of libraries."""
