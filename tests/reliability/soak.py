@@ -9,6 +9,7 @@ scoring, and a world model in a process of its own. Memory is read after each ba
 from __future__ import annotations
 
 import argparse
+import ctypes
 import gc
 import sys
 import tempfile
@@ -39,7 +40,7 @@ class Held:
     seconds: float
     episodes: int
     megabytes: float
-    """Resident memory."""
+    """Resident memory, once the allocator has given back what is free: how much it keeps varies by tens of MB."""
     descriptors: int
     threads: int
     shared: int
@@ -50,6 +51,7 @@ class Held:
 
 def measure(begin: float, episodes: int) -> Held:
     gc.collect()
+    ctypes.CDLL(None).malloc_trim(0)
     pages = int(Path("/proc/self/statm").read_text().split()[1])
     return Held(
         time.monotonic() - begin,
