@@ -11,7 +11,15 @@ import numpy as np
 from numpy.typing import NDArray
 
 from wiw.action import TURN_LEFT, TURN_RIGHT
-from wiw.world_models.pictures import ALTERED, CHANNELS, OTHER, Picture, are_channels_swapped, correlation
+from wiw.world_models.pictures import (
+    ALTERED,
+    CHANNELS,
+    OTHER,
+    Picture,
+    are_channels_swapped,
+    compute_brightness,
+    correlate,
+)
 
 BETTER = 0.15
 """By how much an altered picture has to fit better, in correlation."""
@@ -29,17 +37,17 @@ def describe_alteration(truth: Sequence[Frames], found: Sequence[Frames]) -> str
     pairs = _pairs(truth, found)
     if sum(are_channels_swapped(true, frame) for true, frame in pairs) > len(pairs) / 2:
         return CHANNELS
-    alike = np.mean([correlation(true, frame) for true, frame in pairs])
-    fits = {
-        name: np.mean([correlation(alter(true), frame) for true, frame in pairs]) for name, alter in ALTERED.items()
-    }
+    levels = [(compute_brightness(true), compute_brightness(frame)) for true, frame in pairs]
+    alike = np.mean([correlate(true, frame) for true, frame in levels])
+    fits = {name: np.mean([correlate(alter(true), frame) for true, frame in levels]) for name, alter in ALTERED.items()}
     best = max(fits, key=lambda name: fits[name])
     return f"frames are {best}" if fits[best] > max(OTHER, alike + BETTER) else ""
 
 
 def mean_correlation(truth: Sequence[Frames], found: Sequence[Frames]) -> float:
     """Return the mean correlation of frames with those of the same moments."""
-    return float(np.mean([correlation(true, frame) for true, frame in _pairs(truth, found)]))
+    levels = [[compute_brightness(picture) for picture in pair] for pair in _pairs(truth, found)]
+    return float(np.mean([correlate(*pair) for pair in levels]))
 
 
 def measure_jump_fraction(images: Sequence[NDArray[np.uint8]] | NDArray[np.uint8]) -> float:

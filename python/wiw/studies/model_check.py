@@ -7,6 +7,7 @@ import json
 import time
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
+from functools import cached_property
 from itertools import combinations
 from pathlib import Path
 from typing import Any, Literal
@@ -320,9 +321,13 @@ class _ModelExaminer:
                 f"(in the observations: {usual:.1%}). Clip before the cast: np.clip(frames, 0, 255).astype(np.uint8).",
             )
             return
-        truth = self.queries.true_frames(self.rows, [row.plan for row in self.rows])
-        if fault := describe_alteration(truth, own):
+        if fault := describe_alteration(self._truth, own):
             yield Finding("pictures", f"After frame 0, {fault}, beside what an agent would truly see.")
+
+    @cached_property
+    def _truth(self) -> list[Frames]:
+        """Frames that an agent would truly see after each action of each row's plan."""
+        return self.queries.true_frames(self.rows, [row.plan for row in self.rows])
 
     def _select_action_frames(self) -> list[Frames]:
         """Return the frames of each row that correspond to its actions."""
@@ -344,17 +349,16 @@ class _ModelExaminer:
                 serious=False,
             )
             return
-        own, plans = self._select_action_frames(), [row.plan for row in self.rows]
-        truth = self.queries.true_frames(self.rows, plans)
-        alike = mean_correlation(truth, own)
-        if mean_correlation([frames[::-1] for frames in truth], own) > max(OTHER, alike + MARGIN):
+        own = self._select_action_frames()
+        alike = mean_correlation(self._truth, own)
+        if mean_correlation([frames[::-1] for frames in self._truth], own) > max(OTHER, alike + MARGIN):
             yield Finding(
                 "plan",
                 "Time runs backwards: the frames are those of the plan from its end to its beginning. Frame k is what "
                 "follows action k: frames[:, 1:] = frames[:, :0:-1] turns them round.",
             )
         elif self.accepts.space == PRIMITIVES:
-            swapped = self.queries.true_frames(self.rows, [swap_turns(plan) for plan in plans])
+            swapped = self.queries.true_frames(self.rows, [swap_turns(row.plan) for row in self.rows])
             if mean_correlation(swapped, own) > max(OTHER, alike + MARGIN):
                 yield Finding(
                     "plan",

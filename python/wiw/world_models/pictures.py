@@ -7,6 +7,7 @@ decoded again passes, whatever the model's quality, and what was done to a whole
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Sequence
 
 import numpy as np
@@ -25,6 +26,8 @@ ALIKE, OTHER = 0.9, 0.5
 """Correlations from which pictures show the same, and up to which they do not."""
 DARK = 16.0
 """Mean level up to which an observation may be followed by black."""
+THIRDS = np.full(3, 1 / 3, np.float32)
+"""Weights of the channels in brightness."""
 ALTERED: dict[str, Callable[[NDArray[np.float32]], NDArray[np.float32]]] = {
     "mirrored": lambda picture: picture[:, ::-1],
     "upside down": lambda picture: picture[::-1],
@@ -86,27 +89,32 @@ def find_first_frame_fault(observed: Picture, found: Picture) -> str:
     """Return what is wrong with a frame 0, in words; nothing where it is the observation, if only by and large."""
     if are_channels_swapped(observed, found):
         return CHANNELS
-    alike = correlation(observed, found)
+    one, other = compute_brightness(observed), compute_brightness(found)
+    alike = correlate(one, other)
     if alike >= ALIKE or np.abs(observed - found).mean() <= CLOSE:
         return ""
     for name, alter in ALTERED.items():
-        if correlation(alter(observed), found) >= max(ALIKE, alike + 0.05):
+        if correlate(alter(one), other) >= max(ALIKE, alike + 0.05):
             return f"it is {name}"
     return "" if alike >= OTHER else f"it is another picture (their correlation is {alike:.2f} of 1)"
 
 
 def are_channels_swapped(one: Picture, other: Picture, least: float = OTHER) -> bool:
     """Return whether two pictures, whose brightness must correlate by `least`, show the same with red for blue."""
-    colors = [picture[..., 0] - picture[..., 2] for picture in (one, other)]
-    return correlation(one, other) >= least and _correlate(*colors) <= -OTHER
+    if correlate(compute_brightness(one), compute_brightness(other)) < least:
+        return False
+    return correlate(*[picture[..., 0] - picture[..., 2] for picture in (one, other)]) <= -OTHER
 
 
-def correlation(one: Picture, other: Picture) -> float:
-    """Return the correlation of the brightness of two pictures [..., H, W, 3]; 0 where one has no structure."""
-    return _correlate(one.mean(-1), other.mean(-1))
+def compute_brightness(picture: Picture) -> NDArray[np.float32]:
+    """Return the mean over the channels of a picture [..., H, W, 3], as [..., H, W]."""
+    return picture @ THIRDS
 
 
-def _correlate(one: Picture, other: Picture) -> float:
-    if min(one.std(), other.std()) <= FLAT:
+def correlate(one: NDArray[np.float32], other: NDArray[np.float32]) -> float:
+    """Return Pearson's correlation of two arrays of one shape; 0 where one has no structure (`FLAT`)."""
+    one, other = one - one.mean(), other - other.mean()
+    squares = float(np.vdot(one, one)), float(np.vdot(other, other))
+    if min(squares) <= FLAT**2 * one.size:
         return 0.0
-    return float(np.corrcoef(one.ravel(), other.ravel())[0, 1])
+    return float(np.vdot(one, other)) / math.sqrt(squares[0] * squares[1])
