@@ -15,6 +15,8 @@ from wiw.errors import ArgumentError
 
 ImageFormat = Literal["png", "jpeg"]
 JPEG_QUALITY = 95
+PNG_OPTIONS = (cv2.IMWRITE_PNG_COMPRESSION, 3, cv2.IMWRITE_PNG_STRATEGY, cv2.IMWRITE_PNG_STRATEGY_RLE)
+"""Runs alone: for views smaller than what a search for repeats finds, in half the time."""
 
 
 def to_data_uri(image: NDArray[np.uint8], kind: ImageFormat = "png") -> str:
@@ -25,7 +27,7 @@ def to_data_uri(image: NDArray[np.uint8], kind: ImageFormat = "png") -> str:
     """
     if image.dtype != np.uint8 or image.ndim != 3 or image.shape[2] != 3 or 0 in image.shape:
         raise ArgumentError(f"vlm: expected an image uint8 [H, W, 3], got {image.dtype} {image.shape}")
-    options = [cv2.IMWRITE_PNG_COMPRESSION, 3] if kind == "png" else [cv2.IMWRITE_JPEG_QUALITY, JPEG_QUALITY]
+    options = PNG_OPTIONS if kind == "png" else (cv2.IMWRITE_JPEG_QUALITY, JPEG_QUALITY)
     _, data = cv2.imencode(f".{kind}", cv2.cvtColor(image, cv2.COLOR_RGB2BGR), options)
     return f"data:image/{kind};base64,{base64.b64encode(data.tobytes()).decode()}"
 
