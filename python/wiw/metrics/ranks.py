@@ -10,9 +10,14 @@ from numpy.typing import NDArray
 
 
 def rank_agreement(scores: NDArray[np.float64], true: NDArray[np.float64]) -> float:
-    """Return Kendall's tau-b of two scorings of the same plans; NaN where all scores of one of them are equal."""
-    from scipy.stats import kendalltau
+    """Return Kendall's tau-b of two scorings [N] of the same plans; NaN where all scores of one of them are equal.
 
+    By comparing all pairs, as plans are few: `scipy.stats` gives the same, and takes half a second to load in each
+    process of a run.
+    """
     if len(scores) < 2 or np.ptp(scores) == 0 or np.ptp(true) == 0:
         return math.nan
-    return float(kendalltau(scores, true).statistic)
+    one, other = (np.sign(np.subtract.outer(each, each)) for each in (np.asarray(scores), np.asarray(true)))
+    untied = [np.count_nonzero(order) / 2 for order in (one, other)]  # each pair is compared twice
+    agreement = (one * other).sum() / 2 / math.sqrt(untied[0]) / math.sqrt(untied[1])
+    return float(np.clip(agreement, -1, 1))
