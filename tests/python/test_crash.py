@@ -249,15 +249,17 @@ def test_files_are_whole_or_not_there(tmp_path):
 
 
 STUCK = """
-import hashlib, sys
+import ctypes, sys
 sys.path.insert(0, {here!r})
 from fakes import LineEnv, LineTask
 
 class Env(LineEnv):
     def run(self, actions):
-        if self.actions >= 6:  # some minutes of C code that no signal handler interrupts
+        if self.actions >= 6:  # C code that no signal handler interrupts: it waits for a mutex that it holds
             open({mark!r}, "w").close()
-            hashlib.pbkdf2_hmac("sha256", b"", b"", 1_000_000_000)
+            mutex, library = ctypes.create_string_buffer(64), ctypes.CDLL(None)
+            library.pthread_mutex_lock(mutex)
+            library.pthread_mutex_lock(mutex)
         return super().run(actions)
 
 class Stuck(LineTask):
