@@ -4,12 +4,14 @@
 from __future__ import annotations
 
 import json
+import multiprocessing
 import os
 import signal
 from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any
 
+import cv2
 import numpy as np
 import pytest
 import torch
@@ -28,10 +30,12 @@ from wiw.datasets.navigation_files import (
 )
 from wiw.datasets.navigation_segment import NavigationSegment, encode_color
 from wiw.datasets.parquet_files import MANIFEST
+from wiw.networks import single_thread
 from wiw.training.post_training.corpora import open_corpus
 from wiw.training.post_training.families import PretrainedWeights, find_family
 from wiw.training.post_training.recipe import PostTrainingRecipe, load_recipe
 from wiw.training.post_training.sampling import TrainingSampler
+from wiw.training.post_training.train import post_train
 from wiw.training.post_training.trainer import PostTrainer
 
 FRAMES = {"svd-action": 3, "ltx-action": 9, "nwm-action": 6}
@@ -184,3 +188,28 @@ def require_sampling_unnoticed(plain: PostTrainer, sampled: PostTrainer, sample:
         for trainer in (plain, sampled)
     ]
     assert modes[0] == modes[1]
+
+
+def run_in_a_process(work: Callable[..., Any], *arguments: Any, **options: Any) -> int:
+    """Call a function in a process of its own; return the exit code (negative: the signal).
+
+    The process is forked, as it would import for seconds. Beside an accelerator autograd does not survive a fork.
+    """
+    context = multiprocessing.get_context("spawn" if torch.accelerator.is_available() else "fork")
+    process = context.Process(target=work, args=arguments, kwargs=options, daemon=True)
+    process.start()
+    process.join(300)
+    assert process.exitcode is not None, "it has not ended"
+    return process.exitcode
+
+
+def train_until_killed(step: int, *arguments: Any, **options: Any) -> None:
+    """Post-train, with the state written after each step, and die at one of them."""
+
+    def die(now: int, *_: Any) -> None:
+        if now == step:
+            os.kill(os.getpid(), signal.SIGKILL)
+
+    cv2.setNumThreads(0)  # threads of a forked process are not there
+    with single_thread():
+        post_train(*arguments, seconds=0, on_step=die, **options)

@@ -7,8 +7,6 @@ import io
 import json
 import os
 import signal
-import subprocess
-import sys
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
@@ -20,7 +18,8 @@ import pytest
 import wiw
 from wiw import action
 from wiw.cli.app import main
-from wiw.cli.train_video import RUN_AS, VIDEO
+from wiw.cli.stop import EXIT_RESUME
+from wiw.cli.train_video import RUN_AS, VIDEO, TrainingProgress
 from wiw.errors import ArgumentError, TrainingError
 from wiw.types import Conditioning, Control
 
@@ -30,7 +29,15 @@ pytest.importorskip("pyarrow", reason="no pyarrow: pip install 'wiw[export]'")
 
 import torch
 from folders import contents
-from post_training_parts import make_trainer, save_dataset, save_stock, tiny_recipe, with_nightly
+from post_training_parts import (
+    make_trainer,
+    run_in_a_process,
+    save_dataset,
+    save_stock,
+    tiny_recipe,
+    train_until_killed,
+    with_nightly,
+)
 
 import tiny_pipelines
 from wiw.training.post_training.clip_order import ClipOrder
@@ -353,38 +360,6 @@ def test_a_checkpoint_runs_as_a_world_model(name: str, data: Path, weights: Any,
 # -- resuming ----------------------------------------------------------------------------------------------------------
 
 EPOCHS = 6
-VICTIM = """
-import sys, os, signal, torch
-sys.path[:0] = {path!r}
-torch.set_num_threads(1)
-from post_training_parts import tiny_recipe
-from wiw.training.post_training.nwm import TrainableNWM
-from wiw.training.post_training.recipe import load_recipe
-from wiw.training.post_training.train import post_train
-stop, number = {stop}, {number}
-def on_step(step, steps, loss):
-    print(step, flush=True)
-    if step == stop:
-        os.kill(os.getpid(), number)
-recipe = tiny_recipe({name!r}, epochs={epochs})
-options = dict(weights={weights!r}, device="cpu", recipe=recipe, part="all", seconds=0, on_step=on_step)
-post_train({name!r}, {data!r}, {out!r}, **options)
-"""
-
-
-def _run(name: str, data: Path, weights: Path, out: Path, stop: int, number: int) -> subprocess.CompletedProcess[str]:
-    path = [str(Path(__file__).parent), str(Path(__file__).parents[1])]
-    script = VICTIM.format(
-        path=path,
-        name=name,
-        epochs=EPOCHS,
-        data=str(data),
-        out=str(out),
-        weights=str(weights),
-        stop=stop,
-        number=int(number),
-    )
-    return subprocess.run([sys.executable, "-c", script], capture_output=True, text=True, timeout=300, check=False)
 
 
 def test_a_killed_training_ends_with_the_same_bytes(data: Path, weights: Any, tmp_path: Path) -> None:
@@ -392,8 +367,8 @@ def test_a_killed_training_ends_with_the_same_bytes(data: Path, weights: Any, tm
     options: dict[str, Any] = {"weights": weights(name), "device": "cpu", "part": "all"}
     recipe = tiny_recipe(name, epochs=EPOCHS)
     post_train(name, data, tmp_path / "whole", recipe=recipe, **options)
-    killed = _run(name, data, weights(name), tmp_path / "killed", 4, signal.SIGKILL)
-    assert killed.returncode == -signal.SIGKILL and killed.stdout.split()[-1] == "4", killed.stderr
+    killed = run_in_a_process(train_until_killed, 4, name, data, tmp_path / "killed", recipe=recipe, **options)
+    assert killed == -signal.SIGKILL
     steps: list[int] = []
     post_train(name, data, tmp_path / "killed", recipe=recipe, on_step=lambda step, *_: steps.append(step), **options)
     assert steps == list(range(4, EPOCHS + 1))  # the state after step 3 was the last on disk
@@ -401,29 +376,23 @@ def test_a_killed_training_ends_with_the_same_bytes(data: Path, weights: Any, tm
     assert not list(tmp_path.glob("*.checkpoint"))
 
 
-STOPPED = """
-import os, signal, sys
-from wiw.cli import run_process, train_video
-stock = train_video.TrainingProgress.__call__
-def show(self, step, steps, loss):
-    stock(self, step, steps, loss)
-    if step == 3:
-        os.kill(os.getpid(), signal.SIGTERM)
-train_video.TrainingProgress.__call__ = show
-run_process()
-"""
-
-
-def test_sigterm_writes_the_state_and_other_numbers_do_not_resume(data: Path, weights: Any, tmp_path: Path) -> None:
+def test_sigterm_writes_the_state_and_other_numbers_do_not_resume(
+    data: Path, weights: Any, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
     """As a batch system stops the command."""
-    name, out = "ltx-action", tmp_path / "out"
+    name, out, stock = "ltx-action", tmp_path / "out", TrainingProgress.__call__
+
+    def stop(self: TrainingProgress, step: int, *numbers: Any) -> None:
+        stock(self, step, *numbers)
+        if step == 3:
+            os.kill(os.getpid(), signal.SIGTERM)
+
+    monkeypatch.setattr(TrainingProgress, "__call__", stop)
+    monkeypatch.setattr("wiw.cli.stop.GRACE", 100.0)  # after that it would end the tests
     numbers = ["frames=9", "size=[64, 128]", "batch=4", "clips=4", "epochs=5"]
     command = ["train", name, "--data", str(data), "--weights", str(weights(name)), "--part", "all", "--out", str(out)]
-    command += [each for number in numbers for each in ("--option", number)]
-    ended = subprocess.run(
-        [sys.executable, "-c", STOPPED, *command], capture_output=True, text=True, timeout=300, check=False
-    )
-    assert ended.returncode == 75 and "Repeat the command to resume" in ended.stderr, ended.stderr
+    assert main([*command, *(each for number in numbers for each in ("--option", number))]) == EXIT_RESUME
+    assert "Repeat the command to resume" in capsys.readouterr().err
     assert torch.load(tmp_path / "out.checkpoint", weights_only=True)["step"] == 3 and not out.exists()
     options: dict[str, Any] = {"weights": weights(name), "device": "cpu", "part": "all"}
     with pytest.raises(ArgumentError, match="other data or options"):
