@@ -26,13 +26,15 @@ def to_network_input(images: Tensor, boxes: Tensor) -> Tensor:
 
     The box is a filled rectangle with edges one pixel soft, so that no rounding hides a thin one.
     """
-    colours = images.permute(0, 1, 4, 2, 3).float() / 127.5 - 1
     place = torch.arange(SIDE, dtype=torch.float32)
     low, high = boxes[..., :2, None] * SIDE, boxes[..., 2:, None] * SIDE
     inside = (torch.minimum(place + 1, high) - torch.maximum(place, low)).clamp(0, 1)  # [N, 2, (x, y), 64]
     drawn = 2 * inside[:, :, 1, :, None] * inside[:, :, 0, None, :] - 1
-    stacked = torch.cat([colours, drawn[:, :, None]], dim=2)
-    return stacked.flatten(1, 2).contiguous(memory_format=torch.channels_last)
+    shown = torch.empty(len(images), SIDE, SIDE, 2, 4)  # channels last, as convolutions like it
+    shown[..., :3] = images.permute(0, 2, 3, 1, 4)
+    shown[..., :3].div_(127.5).sub_(1)
+    shown[..., 3] = drawn.permute(0, 2, 3, 1)
+    return shown.flatten(3).permute(0, 3, 1, 2)
 
 
 def estimate_sizes(scalars: Tensor) -> Tensor:
