@@ -23,7 +23,7 @@ from wiw.tasks.imagenav import ImageNav
 from wiw.types import Key, Proposal
 
 NAMES = [name for name in wiw.registry.list_world_models() if name != "none" and not name.endswith(":")]
-SMALL = {"pocket": (288, 512), "warpnet": (288, 512), "armnet": (160, 160)}
+SMALL = {"pocket": (144, 256), "warpnet": (144, 256), "armnet": (80, 80)}
 """(height, width) in which these are checked for every change: they draw in any, at a cost that grows with it."""
 FOLDER = Path(wiw.__file__).with_name("world_models")
 PACKAGES = sorted(FOLDER.rglob("__init__.py"))

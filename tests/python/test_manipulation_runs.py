@@ -24,8 +24,8 @@ from wiw.tasks.manipulation import TABLETOP_TASKS, Manipulation
 from wiw.types import Proposal
 
 POLICY = f"{Path(__file__).with_name('pressing_policy.py')}:Pressing"
-SHORT = {"tasks": "push_buttons,slide_block", "actions": 2}
-FLAGS = ["--tasks", "push_buttons,slide_block", "--task-option", "actions=2", "--candidates", "2", "--horizon", "2"]
+SHORT = {"tasks": "push_buttons,slide_block", "actions": 1}
+FLAGS = ["--tasks", "push_buttons,slide_block", "--task-option", "actions=1", "--candidates", "2", "--horizon", "1"]
 ARMS = ["none", "copy", "oracle", "placebo-swapped:oracle"]
 
 
@@ -51,7 +51,7 @@ def test_a_run_has_all_arms_and_episodes_of_each_task_in_turn(run: Path) -> None
     assert log.arms == ARMS and len(log.episodes) == 16 and all(e["status"] == "done" for e in log.episodes)
     with RunStore.read(run) as store:
         assert [episode.info["task"] for episode in store.episodes()] == ["push_buttons", "slide_block"] * 2
-    assert all(e["metrics"]["poses"] <= 2 and e["metrics"]["actions"] == 1 for e in log.episodes)
+    assert all(e["metrics"]["poses"] <= 1 and e["metrics"]["actions"] == 1 for e in log.episodes)
     lines = log.summary().arms
     assert [line.done for line in lines] == [4] * 4
     assert all(line.estimates["success"].scenes == 4 for line in lines)
@@ -75,7 +75,7 @@ def test_a_run_is_verified_compared_and_exported(run: Path, tmp_path: Path, caps
 
 
 def test_two_processes_decide_as_one(run: Path, tmp_path: Path) -> None:
-    agent = AgentRecipe(POLICY, "oracle", candidates=2, horizon=2)
+    agent = AgentRecipe(POLICY, "oracle", candidates=2, horizon=1)
     evaluate(
         TaskRecipe("manipulation", SHORT),
         agent,
@@ -101,7 +101,7 @@ def test_a_run_that_was_stopped_goes_on(run: Path, tmp_path: Path, monkeypatch: 
             raise KeyboardInterrupt
         write(store, row)
 
-    agent = AgentRecipe(POLICY, "oracle", candidates=2, horizon=2)
+    agent = AgentRecipe(POLICY, "oracle", candidates=2, horizon=1)
     with monkeypatch.context() as patch, pytest.raises(KeyboardInterrupt):
         patch.setattr(RunStore, "write", stopping)
         evaluate(

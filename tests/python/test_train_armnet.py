@@ -136,7 +136,11 @@ def test_figures_are_those_of_a_model_that_knows_the_arm_and_no_more(plays: Play
     assert found["changed"]["arm"]["5"] > 10
 
 
-def test_plays_are_kept(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_plays_are_kept(tmp_path: Path, plays: Plays, monkeypatch: pytest.MonkeyPatch) -> None:
+    def record(seed: int, first: int, count: int) -> Plays:
+        return Plays(*(getattr(plays, name)[first : first + count] for name in ("views", "bare", "arm", "poses")))
+
+    monkeypatch.setattr("wiw.training.plays.record_plays", record)
     monkeypatch.setattr("wiw.training.plays.PLAYS_PER_FILE", 2)
     bars: list[tuple[str, int]] = []
 

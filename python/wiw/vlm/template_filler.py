@@ -31,7 +31,8 @@ class TemplateFiller:
         Raises:
             PromptError: it cannot be filled, or not within the limits on time, memory and length.
         """
-        job = pickle.dumps({"source": source, "slots": dict(slots), "check": check})
+        limit = template_worker.SECONDS
+        job = pickle.dumps({"source": source, "slots": dict(slots), "check": check, "seconds": limit})
         with self._lock:
             reply = self._ask(job, path)
         if "unknown" in reply:

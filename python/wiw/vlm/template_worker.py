@@ -84,7 +84,7 @@ def serve() -> None:
             job = pickle.load(sys.stdin.buffer)  # noqa: S301 - from the parent
         except EOFError:
             return
-        signal.setitimer(signal.ITIMER_PROF, SECONDS)  # its signal ends the process
+        signal.setitimer(signal.ITIMER_PROF, job["seconds"])  # its signal ends the process
         reply = json.dumps(answer(job))
         signal.setitimer(signal.ITIMER_PROF, 0)
         print(reply, flush=True)  # noqa: T201 - to the parent
