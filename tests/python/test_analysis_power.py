@@ -15,6 +15,12 @@ from wiw.metrics.metric import SUCCESS
 from wiw.studies.evaluate import run_arms
 
 
+@pytest.fixture
+def fewer_runs(monkeypatch):
+    """Simulate about 1,000 runs, not 8,000, where a chance need not be known to a percent."""
+    monkeypatch.setattr("wiw.analysis.power._DRAWS", 30_000)
+
+
 def test_the_power_of_flips_of_single_episodes_is_the_exact_sum():
     """Without correlation: over all numbers of wins and losses of 40 pairs."""
     won, lost, n = 0.3, 0.05, 40
@@ -46,6 +52,7 @@ def test_as_many_episodes_do_show_the_difference():
     assert 0.8 <= plan.by_interval < 0.9
 
 
+@pytest.mark.usefixtures("fewer_runs")
 def test_what_costs_episodes():
     plain = wiw.power(15).episodes
     assert wiw.power(10).episodes > plain
@@ -74,6 +81,7 @@ def test_the_least_difference_is_the_one_that_needs_so_many_scenes(numbers):
     )
 
 
+@pytest.mark.usefixtures("fewer_runs")
 def test_what_shows_less():
     plain = wiw.power(scenes=20).difference
     assert wiw.power(scenes=40).difference < plain
@@ -110,6 +118,7 @@ def test_numbers_that_no_run_could_have(numbers, message):
     assert message in str(error.value)
 
 
+@pytest.mark.usefixtures("fewer_runs")
 def test_command_line(capsys):
     assert main(["power", "15", "--arms", "3"]) == 0
     assert str(wiw.power(15, arms=3)) == capsys.readouterr().out.strip()
@@ -156,6 +165,7 @@ def test_the_correlation_of_a_pilot_is_that_of_its_scenes():
     assert estimate_correlation(np.ones(4), np.arange(4)) == 0
 
 
+@pytest.mark.usefixtures("fewer_runs")
 def test_two_models_five_points_apart_on_each_task(capsys):
     assert main(["power", "5", "--task", "all"]) == 0
     shown = capsys.readouterr().out

@@ -5,6 +5,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
+from functools import cache
 from typing import Any
 
 import numpy as np
@@ -152,6 +153,7 @@ class _Plan:
     def difference_for(self, scenes: int, most: float) -> tuple[float, tuple[float, float]]:
         """Return the least difference up to `most`, to a tenth of a point, and its power."""
 
+        @cache
         def shown(tenths: int) -> tuple[float, float]:
             return self._simulate(tenths / 10, scenes, self._rng())
 
