@@ -12,7 +12,7 @@ import struct
 import subprocess
 import sys
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import Any
@@ -417,7 +417,7 @@ import sys
 from pathlib import Path
 sys.path.insert(0, {here!r})
 from test_damaged_files import read_mutations
-read_mutations({kind!r}, Path({folder!r}), {begin}, {count})
+read_mutations({kinds!r}, Path({folder!r}), {begin}, {count})
 """
 
 
@@ -460,24 +460,28 @@ def subject(kind: str) -> tuple[str, bytes, Callable[[Path], Any]]:
     return name, content, lambda folder: read_surface(folder / read, link="hand")
 
 
-def read_mutations(kind: str, folder: Path, begin: int, count: int) -> None:
-    """Read mutations of a file and print what came of each; a crash ends this process, and the count says where.
+def read_mutations(kinds: Sequence[str], folder: Path, begin: int, count: int) -> None:
+    """Read mutations of files, of the first kind from `begin` on, and print what came of each.
 
-    So does a file that takes too long; one that takes too much memory is refused.
+    A crash ends this process, and the last line says where; so does a file that takes too long. One that takes too much
+    memory is refused.
     """
-    name, content, read = subject(kind)
+    subjects = [subject(kind) for kind in kinds]
     resource.setrlimit(resource.RLIMIT_DATA, (MOST_MEMORY, MOST_MEMORY))
-    for index in range(begin, count):
-        (folder / name).write_bytes(mutate(content, random.Random(f"{kind} {index}")))
-        print(index, end=" ", flush=True)
-        signal.alarm(MOST_SECONDS)
-        try:
-            read(folder)
-            print("read")
-        except Error as error:
-            print(type(error).__name__, str(error).isprintable() or repr(str(error)))
-        except MemoryError:
-            print("FileError", "out of memory")  # as the importing process says it
+    for kind, (name, content, read) in zip(kinds, subjects, strict=True):
+        for index in range(begin, count):
+            (folder / kind / name).write_bytes(mutate(content, random.Random(f"{kind} {index}")))
+            print(kind, index, "", sep="\t", end="", flush=True)
+            signal.alarm(MOST_SECONDS)
+            try:
+                read(folder / kind)
+                print("read")
+            except Error as error:
+                print(type(error).__name__)
+            except MemoryError:
+                print("FileError")  # as the importing process says it
+            signal.alarm(0)
+        begin = 0
 
 
 KINDS = (
@@ -486,37 +490,39 @@ KINDS = (
 )  # fmt: skip
 
 
-@pytest.mark.parametrize("kind", KINDS)
-def test_mutations_end_in_errors_of_wiw(tmp_path: Path, kind: str) -> None:
+def test_mutations_end_in_errors_of_wiw(tmp_path: Path) -> None:
     """Readers may crash on what nobody foresaw, in a process of their own; any other error than wiw's is a defect."""
-    check_mutations(tmp_path, kind, 30)
+    check_mutations(tmp_path, KINDS, 30)
 
 
 @pytest.mark.nightly
 @pytest.mark.parametrize("kind", [*KINDS, "link glb", "link dae", "link binary ply"])
 def test_many_mutations_end_in_errors_of_wiw(tmp_path: Path, kind: str) -> None:
-    check_mutations(tmp_path, kind, 20_000)
+    check_mutations(tmp_path, [kind], 20_000)
 
 
-def check_mutations(tmp_path: Path, kind: str, count: int) -> None:
-    for name, content in (("m.obj", OBJ), ("m.mtl", MTL), ("part.png", png())):
-        write(tmp_path / name, content)
-    name, content, read = subject(kind)
-    write(tmp_path / name, content)
-    read(tmp_path)  # whole files are read
-    begin, crashes, refused = 0, [], 0
-    while begin < count:
+def check_mutations(tmp_path: Path, kinds: Sequence[str], count: int) -> None:
+    for kind in kinds:
+        (tmp_path / kind).mkdir()
+        name, content, read = subject(kind)
+        for file, whole in (("m.obj", OBJ), ("m.mtl", MTL), ("part.png", png()), (name, content)):
+            write(tmp_path / kind / file, whole)
+        read(tmp_path / kind)  # whole files are read
+    refused, crashes, left, begin = set(), [], list(kinds), 0
+    while left:
         code = MUTATIONS.format(
-            here=str(Path(__file__).parent), kind=kind, folder=str(tmp_path), begin=begin, count=count
+            here=str(Path(__file__).parent), kinds=left, folder=str(tmp_path), begin=begin, count=count
         )
         done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=False)
-        lines = done.stdout.splitlines()
-        refused += sum("Error" in line for line in lines)
-        assert all(line.split()[1] in ("read", "FileError", "ArgumentError") for line in lines if " " in line.strip())
+        lines = [line.split("\t") for line in done.stdout.splitlines()]
+        ended = lines if done.returncode == 0 else lines[:-1]
+        assert {outcome for *_, outcome in ended} <= {"read", "FileError", "ArgumentError"}, ended
+        refused |= {kind for kind, _, outcome in ended if outcome != "read"}
         if done.returncode == 0:
             break
         assert done.returncode < 0, f"{lines[-1:]}: {done.stderr[-2000:]}"  # a traceback would be 1
-        begin = int(lines[-1].split()[0]) + 1
-        crashes.append((begin - 1, signal.Signals(-done.returncode).name))
-    assert refused > 0 or kind in ("mtl", "png", "link mtl")  # a scene may do without its pictures
+        kind, index = lines[-1][0], int(lines[-1][1])
+        crashes.append((kind, index, signal.Signals(-done.returncode).name))
+        left, begin = left[left.index(kind) :], index + 1
+    assert refused >= {*kinds} - {"mtl", "png", "link mtl"}  # a scene may do without its pictures
     assert crashes == []
