@@ -352,7 +352,7 @@ def test_a_stopped_run_says_how_to_go_on(tmp_path, sent, code):
     assert process.returncode == code, shown
     assert f"wiw resume {out}" in shown and "Traceback" not in shown
     assert 0 < len(load_run(out).episodes) < 30
-    assert main(["resume", str(out), "--no-report", "--workers", "2"]) == 0
+    assert main(["resume", str(out), "--no-report", "--workers", "1"]) == 0
     assert load_run(out).complete
 
 

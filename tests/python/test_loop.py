@@ -47,13 +47,17 @@ def at_once(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("wiw.loop.attempts.PAUSES", (0.0, 0.0))
 
 
+SIZE = (144, 256)
+"""Height and width in which models here answer: a quarter of the panorama's."""
+
+
 class Stamp(wiw.WorldModel):
     """Writes seed and plan into its frames, so that a reader sees what it was asked."""
 
-    accepts = wiw.accepts(control="trajectory", view="panorama", causal=True)
+    accepts = wiw.accepts(control="trajectory", view="panorama", size=SIZE, causal=True)
 
     def rollout(self, observations, controls, seeds):
-        frames = np.zeros((len(controls), len(controls[0].actions) + 1, 576, 1024, 3), np.uint8)
+        frames = np.zeros((len(controls), len(controls[0].actions) + 1, *SIZE, 3), np.uint8)
         frames[:, 0] = observations.image
         for row, (control, seed) in enumerate(zip(controls, seeds, strict=True)):
             for k in range(len(control.actions)):
@@ -81,7 +85,7 @@ def run(task, agent, count=3, live=2, seed=0):
 
 @pytest.fixture
 def task(two_rooms: str) -> ImageNav:
-    return ImageNav(scenes=two_rooms, decisions=4)
+    return ImageNav(scenes=two_rooms, decisions=3)
 
 
 @pytest.mark.parametrize(
@@ -139,7 +143,7 @@ def test_the_oracle_imagines_what_then_happens(task: ImageNav) -> None:
 class Chunked(Stamp):
     """Answers two primitives a call, each frame brighter than the one before."""
 
-    accepts = wiw.accepts(control="trajectory", view="panorama", frames=3)
+    accepts = wiw.accepts(control="trajectory", view="panorama", size=SIZE, frames=3)
 
     def rollout(self, observations, controls, seeds):
         steps = np.arange(1, 4, dtype=np.uint8)[None, :, None, None, None]
@@ -157,7 +161,7 @@ def test_a_policy_that_reads_only_ends_is_shown_the_same_ends(task: ImageNav, mo
         frames = FrameSpec("panorama", (72, 128), ends=True)
 
     whole, ends = (
-        run(task, wiw.Agent(policy(), model, candidates=4, observers=[FidelityObserver()]), count=2)
+        run(task, wiw.Agent(policy(), model, candidates=4, observers=[FidelityObserver()]), count=1)
         for policy in (Whole, Ends)
     )
     assert whole.decisions.keys() == ends.decisions.keys()
@@ -314,14 +318,14 @@ def test_models_are_refused_that_ask_for_what_nobody_gives() -> None:
 
 def test_a_model_gets_its_own_words_and_numbers(task: ImageNav) -> None:
     class Talker(Stamp):
-        accepts = wiw.accepts(control="text", template=TextTemplate(prompt="Walk: {actions}!"))
+        accepts = wiw.accepts(control="text", size=SIZE, template=TextTemplate(prompt="Walk: {actions}!"))
 
         def rollout(self, observations, controls, seeds):
             assert all(control.text.startswith("Walk: ") and control.ids is None for control in controls)
             return super().rollout(observations, controls, seeds)
 
     class Numbers(Stamp):
-        accepts = wiw.accepts(control="action", null_first=True)
+        accepts = wiw.accepts(control="action", size=SIZE, null_first=True)
 
         def rollout(self, observations, controls, seeds):
             assert all(control.ids.tolist() == [0, *control.actions.tolist()] for control in controls)
@@ -469,8 +473,8 @@ def record_of(decision) -> DecisionRecord:
 
 def test_a_model_may_not_answer_in_the_memory_of_an_earlier_answer(task: ImageNav) -> None:
     class Reusing(Stamp):
-        accepts = wiw.accepts(control="trajectory", view="panorama", best_batch=1, frames=6)
-        _memory = np.zeros((1, 6, 576, 1024, 3), np.uint8)
+        accepts = wiw.accepts(control="trajectory", view="panorama", size=SIZE, best_batch=1, frames=6)
+        _memory = np.zeros((1, 6, *SIZE, 3), np.uint8)
 
         def rollout(self, observations, controls, seeds):
             self._memory[:] = super().rollout(observations, controls, seeds)
