@@ -23,7 +23,7 @@ from wiw.tasks.imagenav import ImageNav
 from wiw.types import Key, Proposal
 
 NAMES = [name for name in wiw.registry.list_world_models() if name != "none" and not name.endswith(":")]
-SMALL = {"pocket": (144, 256), "warpnet": (144, 256), "armnet": (80, 80)}
+SMALL = dict.fromkeys(("copy", "oracle", "warp", "warpnet", "pocket"), (144, 256)) | {"armnet": (160, 160)}
 """(height, width) in which these are checked for every change: they draw in any, at a cost that grows with it."""
 FOLDER = Path(wiw.__file__).with_name("world_models")
 PACKAGES = sorted(FOLDER.rglob("__init__.py"))
@@ -105,7 +105,7 @@ import wiw
 class Fog(wiw.WorldModel):
     """Everything fades."""
 
-    accepts = wiw.accepts(control="trajectory", view="perspective", size=(480, 480), frames=14)
+    accepts = wiw.accepts(control="trajectory", view="perspective", size=(120, 120), frames=14)
 
     def rollout(self, observations, controls, seeds):
         fade = np.linspace(1, 0, 14)[None, :, None, None, None]

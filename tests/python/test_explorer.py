@@ -362,7 +362,7 @@ def test_confidence_is_calibrated_by_a_run(episode, tmp_path):  # noqa: F811
     file = tmp_path / "asked.json"
     episodes.save(file, [episode], "aeqa")
     task = TaskRecipe("aeqa", {"episode_file": str(file)})
-    wiw.evaluate(task, agent, 1, out=tmp_path / "run", progress=False)
+    wiw.evaluate(task, agent, 1, out=tmp_path / "run", progress=False, keep_images=0)
     curves = write_calibration(tmp_path / "run", tmp_path / "own.json")
     assert set(curves) == {""} and json.loads((tmp_path / "own.json").read_text()) == curves
     assert 0 < curves[""]["right"][0] < 1 and 0 < curves[""]["support"][0] <= 1

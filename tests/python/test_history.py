@@ -215,11 +215,11 @@ def test_histories_do_not_depend_on_what_else_is_live(task: ImageNav, frames: in
 def test_nor_on_workers_or_the_wire(two_rooms: str, tmp_path: Path) -> None:
     here = f"{Path(__file__).with_name('history_models.py')}:Recalling"
     task = TaskRecipe("imagenav", {"scenes": two_rooms, "decisions": 3})
-    agent = AgentRecipe("heuristic", here, reviser="matcher")
+    agent, quiet = AgentRecipe("heuristic", here, reviser="matcher"), {"progress": False, "keep_images": 0}
     with serve_in_background(Recalling) as server:
         arms = [here, f"remote:{server.address}"]
-        one = wiw.evaluate(task, agent, 3, out=tmp_path / "1", live=3, arms=arms, cache="off", progress=False)
-    two = wiw.evaluate(task, agent, 3, out=tmp_path / "2", workers=2, live=1, progress=False)
+        one = wiw.evaluate(task, agent, 2, out=tmp_path / "1", live=2, arms=arms, cache="off", **quiet)
+    two = wiw.evaluate(task, agent, 2, out=tmp_path / "2", workers=2, live=1, **quiet)
 
     def facts(log):
         found = {}

@@ -230,7 +230,8 @@ def run(two_rooms, tmp_path_factory):
 
     def made(workers, live):
         out = tmp_path_factory.mktemp("run") / "r"
-        return wiw.evaluate(task, agent, 3, out=out, workers=workers, live=live, arms=arms, progress=False)
+        quiet = {"progress": False, "keep_images": 0}
+        return wiw.evaluate(task, agent, 3, out=out, workers=workers, live=live, arms=arms, **quiet)
 
     return made(1, 3), made(2, 1)
 

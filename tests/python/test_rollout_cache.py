@@ -285,11 +285,12 @@ class Logged(wiw.WorldModel):
 
 def test_the_same_run_twice_asks_nothing(tmp_path, two_rooms) -> None:
     (tmp_path / "logged.py").write_text(MODEL)
-    task = TaskRecipe("imagenav", {"scenes": two_rooms, "decisions": 3})
+    task = TaskRecipe("imagenav", {"scenes": two_rooms, "decisions": 2})
     agent = wiw.runs.recipes.AgentRecipe("heuristic", f"{tmp_path}/logged.py:Logged", reviser="matcher")
+    quiet = {"progress": False, "keep_images": 0}
 
     def run(name, **options):
-        log = wiw.evaluate(task, agent, 3, out=tmp_path / name, progress=False, cache=tmp_path / "cache", **options)
+        log = wiw.evaluate(task, agent, 2, out=tmp_path / name, cache=tmp_path / "cache", **quiet, **options)
         lines = (tmp_path / "logged.log").read_text().count("asked")
         facts = [(row["episode"], row["decision"], row["scores"], row["executed"]) for row in log.decisions]
         return facts, lines
@@ -299,6 +300,6 @@ def test_the_same_run_twice_asks_nothing(tmp_path, two_rooms) -> None:
     assert calls > 0 and after == calls and again == first
     processes, after = run("p", workers=2)
     assert after == calls and processes == first
-    uncached = wiw.evaluate(task, agent, 3, out=tmp_path / "c", progress=False, cache="off")
+    uncached = wiw.evaluate(task, agent, 2, out=tmp_path / "c", cache="off", **quiet)
     assert [(r["episode"], r["decision"], r["scores"], r["executed"]) for r in uncached.decisions] == first
     assert (tmp_path / "logged.log").read_text().count("asked") > calls

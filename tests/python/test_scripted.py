@@ -101,7 +101,7 @@ def test_choosing_by_true_futures_pays(tmp_path: Path) -> None:
     for name in ("none", "copy", "oracle"):
         task = Manipulation("slide_block", seed=5, actions=5)
         agent = wiw.Agent("scripted", None if name == "none" else name, candidates=4)
-        log = evaluate(task, agent, 2, out=tmp_path / name, progress=False)
+        log = evaluate(task, agent, 2, out=tmp_path / name, progress=False, keep_images=0)
         assert all(episode["status"] == "done" for episode in log.episodes)
         rates[name] = np.mean([episode["metrics"]["success"] for episode in log.episodes])
     assert rates["copy"] == rates["none"]
