@@ -12,6 +12,7 @@ from __future__ import annotations
 
 import contextlib
 import ctypes
+import gc
 import importlib
 import itertools
 import json
@@ -182,6 +183,7 @@ def serve():
     for name in (*IMPORTS, *sys.argv[1:]):
         with contextlib.suppress(ModuleNotFoundError):  # of an extra
             importlib.import_module(name)
+    gc.freeze()  # or each victim's first collection would go through, and copy, all that was imported
 
     print("ready", flush=True)
     for line in sys.stdin:
