@@ -20,8 +20,11 @@ from wiw.nav import NavMesh
 from wiw.render import Renderer
 from wiw.types import Episode
 
-SPEC = "apartments:val/3?color:sofa_1=red&state:floor_lamp_1=off&state:pendant_lamp_1=off&state:toilet_1=open"
-EDITED = {"sofa 1", "floor lamp 1", "pendant lamp 1", "toilet 1"}
+SPEC = (
+    "apartments:val/3?color:sofa_1=red&color:walls_of_bedroom_1=red&state:floor_lamp_1=off&state:pendant_lamp_1=off&"
+    "state:toilet_1=open"
+)
+EDITED = {"sofa 1", "walls of bedroom 1", "floor lamp 1", "pendant lamp 1", "toilet 1"}
 
 
 @pytest.fixture(scope="module")
@@ -89,10 +92,9 @@ def test_pictures_differ_in_what_was_edited_and_in_its_light(plain: scenes.Scene
     assert (before["color"][near] != after["color"][near]).any()
 
 
-def test_a_recoloured_wall_bounces_its_colour(plain: scenes.Scene) -> None:
-    red = scenes.apartment(3, "val", edits=["color:walls_of_bedroom_1=red"])
+def test_a_recoloured_wall_bounces_its_colour(plain: scenes.Scene, edited: scenes.Scene) -> None:
     poses = poses_in(plain, "bedroom 1")
-    before, after = (Renderer(scene, backend="cpu").panorama(poses, (288, 576)) for scene in (plain, red))
+    before, after = (Renderer(scene, backend="cpu").panorama(poses, (288, 576)) for scene in (plain, edited))
     ceiling = next(row["id"] for row in plain.instances if row["name"] == "ceiling of bedroom 1")
     overhead = before["instance"] == ceiling
 
@@ -144,7 +146,10 @@ def _obstacles(seed: int) -> list[str]:
 
 
 def test_specs_have_one_spelling() -> None:
-    other = "apartments:val/3?state:toilet+1=open&color:sofa_1=red&state:pendant_lamp_1=off&state:floor+lamp_1=off"
+    other = (
+        "apartments:val/3?state:toilet+1=open&color:sofa_1=red&color:walls+of_bedroom_1=red&"
+        "state:pendant_lamp_1=off&state:floor+lamp_1=off"
+    )
     assert scenes.resolve(other) == [SPEC] == scenes.resolve(SPEC)
     assert scenes.is_generated(SPEC) and scenes.absolute(SPEC) == SPEC
     assert scenes.resolve("apartments:val/3") == ["apartments:val/3"]
