@@ -9,7 +9,7 @@ from wiw.analysis.summary import summarise
 from wiw.errors import ArgumentError
 from wiw.report.episodes import read_stories
 from wiw.report.maps import frame_of_picture, frame_of_points, start_and_goal, trail
-from wiw.report.page import SCALES, render, sentence
+from wiw.report.page import SCALES, _gather_findings, _render_page, render, sentence
 from wiw.report.plans import format_glyphs
 from wiw.report.plots import BLAME_COLORS, _choose_text_color
 from wiw.report.story import Album
@@ -112,8 +112,9 @@ def test_a_report_shows_as_many_episodes_as_asked_the_most_telling_first(log, tm
 
 
 def test_a_report_of_limited_size_shrinks_pictures_and_then_leaves_out_episodes(log, tmp_path):
+    findings = _gather_findings(log)
     sizes = {
-        (episodes, scale): len(render(log, episodes, scale).encode())
+        (episodes, scale): len(_render_page(log, findings, episodes, scale, "").encode())
         for episodes, scale in ((2, 1.0), (2, SCALES[-1]), (1, 1.0), (1, SCALES[-1]), (0, 1.0))
     }
     shrunk = log.report(tmp_path / "shrunk.html", max_mb=(sizes[2, 1.0] - 1) / 1e6)
