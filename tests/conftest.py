@@ -111,6 +111,22 @@ def one_torch_thread() -> Iterator[None]:
         yield
 
 
+@pytest.fixture(scope="module")
+def fewer_denoising_steps() -> Iterator[None]:
+    """A tenth of the steps of video generators: with random weights there is only noise to see."""
+    from wiw.world_models.video.model import VideoModel
+
+    stock = VideoModel.__post_init__
+
+    def shorten(self: VideoModel) -> None:
+        self.steps = max(1, self.steps // 10)
+        stock(self)
+
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(VideoModel, "__post_init__", shorten)
+        yield
+
+
 @pytest.fixture(scope="session")
 def franka_urdf() -> Path:
     """The maker's description of the Panda with its meshes: `WIW_PANDA_URDF`, or package example-robot-data."""

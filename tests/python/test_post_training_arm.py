@@ -43,7 +43,7 @@ from wiw.training.post_training.sampling import create_sampler
 from wiw.training.post_training.train import post_train, write_checkpoint
 from wiw.types import GRIPPER_POSES
 
-pytestmark = pytest.mark.usefixtures("one_torch_thread")
+pytestmark = pytest.mark.usefixtures("one_torch_thread", "fewer_denoising_steps")
 
 NAMES = sorted(name for name, family in FAMILIES.items() if isinstance(family, VideoFamily))
 SHAPES: dict[str, Any] = {name: {"size": SIZES.get(name, (32, 32))} for name in NAMES}

@@ -6,7 +6,6 @@ from __future__ import annotations
 import json
 import sys
 import types
-from collections.abc import Iterator
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
@@ -44,26 +43,11 @@ from wiw.training.post_training.trackers import open_tracker
 from wiw.training.post_training.train import post_train, write_checkpoint
 from wiw.training.post_training.training_log import TrainingLog
 from wiw.types import Conditioning
-from wiw.world_models.video.model import VideoModel
 
 NAMES = sorted(name for name, family in FAMILIES.items() if isinstance(family, VideoFamily))
 SPLIT = {"held_out": 0.76, "validate_every": 2, "validate_clips": 3}
 """Share of the three scenes that leaves "house" for training."""
-pytestmark = pytest.mark.usefixtures("one_torch_thread")
-
-
-@pytest.fixture(autouse=True, scope="module")
-def fewer_steps() -> Iterator[None]:
-    """A tenth of each generator's denoising steps, as there is nothing to see in noise."""
-    stock = VideoModel.__post_init__
-
-    def shorten(self: VideoModel) -> None:
-        self.steps //= 10
-        stock(self)
-
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(VideoModel, "__post_init__", shorten)
-        yield
+pytestmark = pytest.mark.usefixtures("one_torch_thread", "fewer_denoising_steps")
 
 
 @pytest.fixture(scope="module")
