@@ -16,7 +16,7 @@ from wiw.errors import ArgumentError
 ImageFormat = Literal["png", "jpeg"]
 JPEG_QUALITY = 95
 PNG_OPTIONS = (cv2.IMWRITE_PNG_COMPRESSION, 3, cv2.IMWRITE_PNG_STRATEGY, cv2.IMWRITE_PNG_STRATEGY_RLE)
-"""Runs alone: for views smaller than what a search for repeats finds, in half the time."""
+"""Run-length coding: for rendered views smaller files than a search for repeats gives, in half the time."""
 
 
 def to_data_uri(image: NDArray[np.uint8], kind: ImageFormat = "png") -> str:
