@@ -491,7 +491,7 @@ def test_the_command_wants_views_as_it_will_see_them(tmp_path: Path, capsys: pyt
 def test_the_command_trains_on_what_was_collected(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     pytest.importorskip("pyarrow", reason="needs wiw[export]")
     demos, out = str(tmp_path / "demos"), tmp_path / "weights.safetensors"
-    few = ["--tasks", "slide_block", "--episodes", "2", "--frames", "9", "--depth", "--wrist"]
+    few = ["--tasks", "slide_block", "--episodes", "2", "--frames", "16", "--depth", "--wrist"]
     assert main(["collect", "manipulation", *few, "--out", demos]) == 0
     assert main(["train", "diffuser", "--demonstrations", demos, "--epochs", "2", "--out", str(out)]) == 0
     assert "2 demonstrations" in capsys.readouterr().out
