@@ -15,6 +15,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
+from scipy.spatial.distance import pdist
 from scipy.spatial.transform import Rotation
 
 import wiw
@@ -23,6 +24,7 @@ from wiw.datasets.demonstration import Demonstration, decode_colors, decode_dept
 from wiw.errors import ArgumentError, FileError, WeightsError
 from wiw.policies.base import Situation
 from wiw.policies.diffuser import paths
+from wiw.policies.diffuser.paths import MIDDLE
 from wiw.policies.diffuser.workspace import CELL, NOWHERE, WORKSPACE, WRIST_SIZE, PinholeCamera
 from wiw.studies.run_log import load_run
 from wiw.tabletop.cloud import unproject_depth
@@ -39,7 +41,7 @@ from wiw.policies.diffuser.diffusion import ALPHA_BARS, NOISE_LEVELS, add_noise,
 from wiw.policies.diffuser.network import EncodedScene, Network, Shape  # noqa: E402
 from wiw.policies.diffuser.weights import load, save  # noqa: E402
 from wiw.training.checkpoint import Checkpoint  # noqa: E402
-from wiw.training.diffuser import Recipe, Samples, extract_samples, train  # noqa: E402
+from wiw.training.diffuser import Augmentation, Recipe, Samples, extract_samples, train  # noqa: E402
 
 pytestmark = pytest.mark.usefixtures("one_torch_thread")
 
@@ -378,8 +380,50 @@ def test_moments_are_the_beginnings_of_parts(shown: list[Demonstration], seen: S
         extract_samples([], LENS)
 
 
+@pytest.mark.parametrize("mirror", [0.0, 1.0])
+def test_an_augmented_scene_keeps_its_distances_and_moves_with_its_path(
+    shown: list[Demonstration], mirror: float
+) -> None:
+    """Distances between what is seen, the gripper and its path stay; so do angles, seen in a mirror or not."""
+    samples = extract_samples(shown, LENS, WRIST_INTRINSICS)
+    recipe = Recipe(batch=3, tilt=0.4, mirror=mirror, recolor=0.0)
+    change = Augmentation.draw(3, recipe, np.random.default_rng(0))
+    chosen = np.array([0, 1, 0])
+    poses = np.concatenate([samples.pose[chosen, None], samples.path[chosen]], axis=1)
+    changed, view = change.change_poses(poses), samples.views[0]
+    places = change.change_view(view, chosen).places.numpy()
+    for row, original in enumerate(chosen):
+        flipped = view.places[original][:, ::-1] if mirror else view.places[original]
+        seen = flipped[..., 2] > NOWHERE[2]
+        before = np.concatenate([flipped[seen], poses[row, :, :3]])
+        after = np.concatenate([places[row][seen], changed[row, :, :3]])
+        np.testing.assert_allclose(pdist(after), pdist(before), atol=1e-5)
+        np.testing.assert_allclose(after[:, 2], before[:, 2], atol=1e-6)
+        turns = Rotation.from_euler("xyz", changed[row, :, 3:6]).as_matrix()
+        flip = np.diag([1, -1 if mirror else 1, 1])
+        whole = Rotation.from_euler("z", change.angles[row]).as_matrix() @ flip
+        np.testing.assert_allclose(
+            turns, whole @ Rotation.from_euler("xyz", poses[row, :, 3:6]).as_matrix() @ flip, atol=1e-9
+        )
+        np.testing.assert_allclose(after[-1] - MIDDLE, whole @ (before[-1] - MIDDLE), atol=1e-6)
+    assert not np.allclose(changed, poses) and (changed[..., 6] == poses[..., 6]).all()
+
+
+def test_an_augmented_picture_has_other_colours_in_the_same_places(shown: list[Demonstration]) -> None:
+    samples = extract_samples(shown, LENS)
+    chosen, (view,) = np.arange(2), samples.views
+    change = Augmentation(
+        np.ones((2, 1, 1, 3), np.float32), np.array([[2, 0, 1], [0, 1, 2]]), np.array([True, False]), np.zeros(2)
+    )
+    image = change.change_view(view, chosen).image.numpy()
+    np.testing.assert_array_equal(image[0], view.image[0][:, ::-1][..., [2, 0, 1]])
+    np.testing.assert_array_equal(image[1], view.image[1])
+    drawn = Augmentation.draw(400, Recipe(recolor=1.0), np.random.default_rng(0))
+    assert len(np.unique(drawn.channels, axis=0)) == 6 and 150 < drawn.mirrored.sum() < 250
+
+
 def test_it_learns_two_demonstrations_by_heart(shown: list[Demonstration], seen: Samples) -> None:
-    recipe = Recipe(epochs=150, batch=2, levels=8, width=48, layers=2, tilt=0.0, rate=3e-3, average=0.97)
+    recipe = Recipe(epochs=150, batch=2, levels=8, width=48, layers=2, tilt=0.0, mirror=0.0, rate=3e-3, average=0.97)
     network, _ = train(seen, recipe)
     policy = Diffuser.from_network(network)
     for each, path in zip(shown, seen.path, strict=True):

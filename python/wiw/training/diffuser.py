@@ -7,7 +7,7 @@ from collections.abc import Callable, Iterable, Iterator, Mapping
 from copy import deepcopy
 from dataclasses import dataclass
 from functools import partial
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import torch
@@ -31,6 +31,10 @@ if TYPE_CHECKING:
 
 SUBTASK_LENGTHS: Mapping[str, int] = {"push_buttons": 3, "slide_block": 4, "insert_peg": 6, "stack_cups": 6}
 """Number of an expert's actions that achieve one subtask: one button pushed, or one object slid or placed."""
+
+
+MIRRORED_POSE = np.array([1, -1, 1, -1, 1, -1, 1.0])
+"""Factors of a gripper's pose whose left and right are exchanged; the middle of the workspace is at y = 0."""
 
 
 @dataclass(frozen=True)
@@ -67,6 +71,13 @@ class Recipe:
     """Weight of errors of the gripper's opening."""
     tilt: float = 0.1
     """Augmentation: greatest rotation of a scene about the middle of the workspace, in radians."""
+    mirror: float = 0.5
+    """Augmentation: share of scenes whose left and right are exchanged."""
+    recolor: float = 0.8
+    """Augmentation: share of scenes whose red, green and blue are exchanged at random.
+
+    Which colour is meant the policy is not told. Without this it learns by heart what was meant at each table.
+    """
     average: float = 0.995
     """Decay of the exponential moving average of the weights, late in training."""
     seed: int = 0
@@ -189,7 +200,7 @@ class _Trainer(ResumableTrainer):
     def train_step(self, learning_rate: float) -> float:
         """Train on one batch of samples and return its loss."""
         key = core.fold_key([self.recipe.seed, 0xD1F2, self.step_count])
-        batch = sample_batch(self.samples, self.recipe.batch, self.recipe.tilt, np.random.default_rng(key))
+        batch = sample_batch(self.samples, self.recipe, np.random.default_rng(key))
         loss = self._compute_loss(batch, torch.Generator().manual_seed(key % 2**63))
         loss.backward()
         apply_gradients(self.optimiser, self.network, learning_rate)
@@ -238,26 +249,60 @@ class Batch:
     """[B, L, 10]."""
 
 
-def sample_batch(samples: Samples, count: int, tilt: float, rng: np.random.Generator) -> Batch:
-    """Sample random rows, and augment them: rotated about the middle of the workspace by up to `tilt` radians, with
-    other brightness and tint.
-    """
+def sample_batch(samples: Samples, recipe: Recipe, rng: np.random.Generator) -> Batch:
+    """Sample random rows, and augment them as the recipe says, with other brightness and tint."""
+    count = recipe.batch
     chosen = rng.integers(0, len(samples), count)
-    light = rng.uniform(0.8, 1.2, (count, 1, 1, 1)) * rng.uniform(0.92, 1.08, (count, 1, 1, 3))
-    angles = rng.uniform(-tilt, tilt, count)
-    turns = Rotation.from_euler("z", angles[:, None]).as_matrix()
-    poses = np.concatenate([samples.pose[chosen, None], samples.path[chosen]], axis=1)
-    poses[..., :3] = np.einsum("bij,blj->bli", turns, poses[..., :3] - MIDDLE) + MIDDLE
-    poses[..., 5] += angles[:, None]
+    augmentation = Augmentation.draw(count, recipe, rng)
+    poses = augmentation.change_poses(np.concatenate([samples.pose[chosen, None], samples.path[chosen]], axis=1))
     vectors = torch.from_numpy(to_vectors(poses))
-    views = [_augment_view(each, chosen, light.astype(np.float32), turns) for each in samples.views]
+    views = [augmentation.change_view(each, chosen) for each in samples.views]
     return Batch(views, vectors[:, 0], vectors[:, 1:])
 
 
-def _augment_view(
-    view: WorkspaceView, chosen: NDArray[np.int64], light: NDArray[np.float32], turns: NDArray[np.float64]
-) -> Views:
-    """Return the chosen rows in another light [B, 1, 1, 3], rotated by matrices [B, 3, 3] about the middle."""
-    images = (view.image[chosen] * light).clip(0, 255).astype(np.uint8)
-    places = np.einsum("bij,bhwj->bhwi", turns, view.places[chosen] - MIDDLE) + MIDDLE
-    return to_tensors(WorkspaceView(images, view.height[chosen], places.astype(np.float32)))
+@dataclass(frozen=True)
+class Augmentation:
+    """Changes of B samples: of colours, and of the scene about the middle of the workspace."""
+
+    light: NDArray[np.float32]
+    """float32 [B, 1, 1, 3]: factors of red, green and blue."""
+    channels: NDArray[np.int64]
+    """int64 [B, 3]: which channel becomes red, green and blue."""
+    mirrored: NDArray[np.bool_]
+    """bool [B]: whether left and right are exchanged."""
+    angles: NDArray[np.float64]
+    """float64 [B]: rotation about the vertical in radians, once mirrored."""
+
+    @classmethod
+    def draw(cls, count: int, recipe: Recipe, rng: np.random.Generator) -> Augmentation:
+        """Draw changes at random."""
+        light = rng.uniform(0.8, 1.2, (count, 1, 1, 1)) * rng.uniform(0.92, 1.08, (count, 1, 1, 3))
+        angles = rng.uniform(-recipe.tilt, recipe.tilt, count)
+        mirrored = rng.random(count) < recipe.mirror
+        exchanged = rng.random(count) < recipe.recolor
+        channels = np.where(exchanged[:, None], rng.permuted(np.tile(np.arange(3), (count, 1)), axis=1), np.arange(3))
+        return cls(light.astype(np.float32), channels, mirrored, angles)
+
+    def change_poses(self, poses: NDArray[np.float64]) -> NDArray[np.float64]:
+        """Return poses [B, L, 7] of the changed scenes."""
+        changed = poses.copy()
+        changed[self.mirrored] *= MIRRORED_POSE
+        changed[..., :3] = self._move(changed[..., :3])
+        changed[..., 5] += self.angles[:, None]
+        return changed
+
+    def change_view(self, view: WorkspaceView, chosen: NDArray[np.int64]) -> Views:
+        """Return what a camera sees of the changed scenes in the chosen rows."""
+        image, height, places = (each[chosen] for each in (view.image, view.height, view.places))
+        for each in (image, height, places):
+            each[self.mirrored] = each[self.mirrored, :, ::-1]
+        places[self.mirrored, ..., 1] *= -1
+        places = self._move(places.reshape(len(places), -1, 3)).reshape(places.shape)
+        image = np.take_along_axis(image, self.channels[:, None, None], axis=3)
+        image = (image * self.light).clip(0, 255).astype(np.uint8)
+        return to_tensors(WorkspaceView(image, height, places.astype(np.float32)))
+
+    def _move(self, points: NDArray[Any]) -> NDArray[Any]:
+        """Return points [B, N, 3] rotated about the middle of the workspace."""
+        turns = Rotation.from_euler("z", self.angles[:, None]).as_matrix()
+        return np.einsum("bij,bnj->bni", turns, points - MIDDLE) + MIDDLE
