@@ -42,6 +42,7 @@ from wiw.policies.diffuser.network import EncodedScene, Network, Shape  # noqa: 
 from wiw.policies.diffuser.weights import load, save  # noqa: E402
 from wiw.training.checkpoint import Checkpoint  # noqa: E402
 from wiw.training.diffuser import Augmentation, Recipe, Samples, extract_samples, train  # noqa: E402
+from wiw.training.diffuser_paths import measure_paths  # noqa: E402
 
 pytestmark = pytest.mark.usefixtures("one_torch_thread")
 
@@ -431,6 +432,23 @@ def test_it_learns_two_demonstrations_by_heart(shown: list[Demonstration], seen:
         off = np.linalg.norm(stops[..., :3] - path[:, :3], axis=-1)
         assert np.median(off) < 0.03
         assert (stops[..., 6] == path[:, 6]).mean() > 0.8
+    found = measure_paths(network, seen)
+    assert found["off"] < 0.04 and found["spread"] < 0.1 and found["near/1"] <= found["near/5"] <= found["near/10"]
+    untrained = measure_paths(make_untrained(wrist=True)._network, seen)
+    assert untrained["near/10"] == 0 and untrained["spread"] > found["spread"]
+
+
+def test_held_out_demonstrations_are_chosen_by_their_names(seen: Samples) -> None:
+    rows = np.tile(np.arange(len(seen)), 50)
+    names = tuple(f"slide_block {number}" for number in range(len(rows)))
+    many = replace(seen.select(rows), demonstrations=names)
+    own, held_out = many.hold_out(0.2)
+    assert sorted((*own.demonstrations, *held_out.demonstrations)) == sorted(names)
+    assert 0 < len(held_out) < 0.4 * len(names)
+    fewer = many.select(np.arange(40))
+    assert set(fewer.hold_out(0.2)[1].demonstrations) == {*held_out.demonstrations} & {*fewer.demonstrations}
+    with pytest.raises(ArgumentError, match="collect more"):
+        many.hold_out(1.0)
 
 
 def test_training_that_was_stopped_goes_on_to_the_same_end(seen: Samples, tmp_path: Path) -> None:

@@ -149,8 +149,9 @@ def train(
     warpnet, PSNR and SSIM on the val scenes, beside copy and warp; for pocket, PSNR on windows of the val scenes,
     beside what has learnt nothing, and how much of it is lost where it is told another window's places; for
     perception, accuracy and IoU of categories, accuracy of states and of colour words on the val scenes; for armnet,
-    errors on held-out plays, beside copy and a table where nothing but the arm moves. diffuser is not evaluated. The
-    weights shipped with wiw were trained by this command with its defaults; those of perception for four epochs of a
+    errors on held-out plays, beside copy and a table where nothing but the arm moves; for diffuser, how often one of
+    ten paths is the expert's, for one in twenty demonstrations that it is not trained on. The weights shipped with wiw
+    were trained by this command with its defaults; those of perception for four epochs of a
     schedule that was first laid out for six (docs/perception.md), those of navigator for three of four
     (docs/navigation-tasks.md), those of pocket on 16 800 clips, those of recogniser by an earlier recipe
     (docs/results.md).
@@ -446,6 +447,7 @@ def _train_diffuser(
     from wiw.policies.diffuser.workspace import PinholeCamera
     from wiw.training import diffuser as training
     from wiw.training.checkpoint import Checkpoint
+    from wiw.training.diffuser_paths import PATHS, measure_paths
 
     if demonstrations is None:
         raise ArgumentError(
@@ -461,14 +463,22 @@ def _train_diffuser(
     samples = training.extract_samples(
         _show_bar(collection, "reading", len(collection)), camera, collection.wrist_intrinsics
     )
-    card: dict[str, Any] = {"demonstrations": collection.config, "moments": len(samples)}
+    own, held_out = samples.hold_out()
+    card: dict[str, Any] = {"demonstrations": collection.config, "moments": len(own), "held out": len(held_out)}
     identity = {**card, "recipe": asdict(recipe), "minutes": minutes}
     checkpoint = Checkpoint(out.with_name(f"{out.name}.checkpoint"), identity)
     with single_thread(), _StepBar() as steps:
-        network, recipe = training.train(samples, recipe, minutes, steps, checkpoint)
-    save(out, network, {**card, "recipe": asdict(recipe)})
+        network, recipe = training.train(own, recipe, minutes, steps, checkpoint)
+        found = measure_paths(network, held_out) if len(held_out) else {}
+    save(out, network, {**card, "recipe": asdict(recipe), "found": found})
     checkpoint.remove()
-    print(f"{len(collection)} demonstrations, {len(samples)} samples, {recipe.epochs} epochs")
+    print(f"{len(collection)} demonstrations, {len(own)} samples, {recipe.epochs} epochs")
+    if found:
+        near = ", ".join(f"{100 * found[f'near/{count}']:.0f} % within {count}" for count in PATHS)
+        print(
+            f"held out  of {len(held_out)} samples a path like the expert's: {near}; the nearest of {max(PATHS)} is "
+            f"{1000 * found['off']:.0f} mm off, two paths end {1000 * found['spread']:.0f} mm apart"
+        )
 
 
 def _train_armnet(

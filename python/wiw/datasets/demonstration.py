@@ -126,3 +126,8 @@ def decode_pictures(pictures: Sequence[bytes], how: int) -> NDArray[Any]:
         raise FileError(
             f"a picture of a demonstration is damaged ({error}); delete its file, then `wiw collect` makes it anew"
         ) from error
+
+
+def name_demonstration(outline: Outline | Demonstration) -> str:
+    """Return the name by which a demonstration is held out: its task and the seed of its table."""
+    return f"{outline.task} {outline.seed}"

@@ -181,9 +181,9 @@ class SelectedClips(Sequence[NavigationSegment]):
         return self._clips.locate(self._rows[index])
 
 
-def part_of(scene: str, held_out: float) -> Literal["train", "held-out"]:
-    """Return the part that a scene belongs to, by a hash of its name, so that adding scenes moves no other."""
-    number = int.from_bytes(blake2b(scene.encode(), digest_size=8).digest(), "little")
+def part_of(name: str, held_out: float) -> Literal["train", "held-out"]:
+    """Return the part that a scene or demonstration belongs to, by a hash of its name: adding some moves no other."""
+    number = int.from_bytes(blake2b(name.encode(), digest_size=8).digest(), "little")
     return "held-out" if number < held_out * 2**64 else "train"
 
 

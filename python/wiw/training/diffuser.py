@@ -17,7 +17,8 @@ from torch import Tensor
 from torch.nn import functional
 
 from wiw._core import core
-from wiw.datasets.demonstration import decode_colors, decode_depths
+from wiw.datasets.demonstration import decode_colors, decode_depths, name_demonstration
+from wiw.datasets.navigation import part_of
 from wiw.errors import ArgumentError
 from wiw.policies.diffuser.diffusion import ALPHA_BARS, NOISE_LEVELS, add_noise
 from wiw.policies.diffuser.network import Network, Shape, Views, to_tensors
@@ -47,9 +48,27 @@ class Samples:
     """float64 [N, 7]: the gripper's pose."""
     path: NDArray[np.float64]
     """float64 [N, L, 7]: the poses that the gripper went to; a shorter path repeats its last pose."""
+    demonstrations: tuple[str, ...]
+    """[N]: names of the demonstrations that they are from."""
 
     def __len__(self) -> int:
         return len(self.pose)
+
+    def select(self, rows: NDArray[np.int64]) -> Samples:
+        """Return some of the samples, by their numbers."""
+        names = tuple(self.demonstrations[row] for row in rows)
+        return Samples(tuple(each.select(rows) for each in self.views), self.pose[rows], self.path[rows], names)
+
+    def hold_out(self, share: float = 0.05) -> tuple[Samples, Samples]:
+        """Return the samples to train on, and those of a share of the demonstrations, chosen by a hash of their names.
+
+        Raises:
+            ArgumentError: none is left to train on.
+        """
+        rows = np.array([part_of(name, share) == "held-out" for name in self.demonstrations])
+        if rows.all():
+            raise ArgumentError("diffuser: all demonstrations are held out, none is left to train on; collect more")
+        return self.select(np.flatnonzero(~rows)), self.select(np.flatnonzero(rows))
 
 
 @dataclass(frozen=True)
@@ -101,11 +120,16 @@ def extract_samples(
         ArgumentError: there are none, or some are of an unknown task, or without depth or the wrist camera's views.
     """
     cameras = Cameras(camera, wrist_intrinsics)
-    found = [each for demonstration in demonstrations for each in _split_into_subtasks(demonstration, cameras)]
+    found = [
+        (*each, name_demonstration(demonstration))
+        for demonstration in demonstrations
+        for each in _split_into_subtasks(demonstration, cameras)
+    ]
     if not found:
         raise ArgumentError("diffuser: expected demonstrations to learn from, got none")
-    views, poses, paths = zip(*found, strict=True)
-    return Samples(tuple(stack_views(each) for each in zip(*views, strict=True)), np.stack(poses), np.stack(paths))
+    views, poses, paths, names = zip(*found, strict=True)
+    stacked = tuple(stack_views(each) for each in zip(*views, strict=True))
+    return Samples(stacked, np.stack(poses), np.stack(paths), names)
 
 
 @dataclass(frozen=True)
@@ -293,7 +317,8 @@ class Augmentation:
 
     def change_view(self, view: WorkspaceView, chosen: NDArray[np.int64]) -> Views:
         """Return what a camera sees of the changed scenes in the chosen rows."""
-        image, height, places = (each[chosen] for each in (view.image, view.height, view.places))
+        own = view.select(chosen)
+        image, height, places = own.image, own.height, own.places
         for each in (image, height, places):
             each[self.mirrored] = each[self.mirrored, :, ::-1]
         places[self.mirrored, ..., 1] *= -1

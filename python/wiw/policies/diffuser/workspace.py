@@ -38,6 +38,10 @@ class WorkspaceView:
     places: NDArray[np.float32]
     """float32 [..., h / CELL, w / CELL, 3]: positions of the cells' centres in metres, or `NOWHERE`."""
 
+    def select(self, rows: NDArray[np.int64]) -> WorkspaceView:
+        """Return copies of some rows of stacked views, by their numbers."""
+        return WorkspaceView(self.image[rows], self.height[rows], self.places[rows])
+
 
 def stack_views(views: Sequence[WorkspaceView]) -> WorkspaceView:
     """Return N views by one camera as one, with an axis for them in front."""

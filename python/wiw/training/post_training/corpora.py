@@ -19,7 +19,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from wiw import panorama
-from wiw.datasets.demonstration import Demonstration, Outline
+from wiw.datasets.demonstration import Outline, name_demonstration
 from wiw.datasets.demonstrations import Demonstrations, read_manifest
 from wiw.datasets.navigation import META, Clips, NavigationData, Part, part_of
 from wiw.datasets.parquet_files import MANIFEST
@@ -329,11 +329,6 @@ class DemonstrationClips(CorpusClips):
     def describe(self, index: int) -> str:
         """Return task, demonstration and actions."""
         return self._plans.describe(index)
-
-
-def name_demonstration(outline: Outline | Demonstration) -> str:
-    """Return the name by which a demonstration is held out: its task and the seed of its table."""
-    return f"{outline.task} {outline.seed}"
 
 
 def _list_plans(ended: NDArray[np.bool_], longest: int) -> list[tuple[int, int]]:
