@@ -32,9 +32,9 @@ def seeds(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> dict[str, list[byt
 
 def link_extension(seed: bytes) -> str:
     """Return the extension by which cpp/fuzz/link.cpp hands bytes to the reader."""
-    if seed.startswith((b"ply", b"<")):
-        return "ply" if seed.startswith(b"ply") else "dae"
-    return "obj" if b"\nv " in seed else "stl"
+    if seed.startswith(b"ply"):
+        return "ply"
+    return "dae" if seed.startswith(b"<") else "stl"
 
 
 def read_seed(target: str, seed: bytes, folder: Path) -> Any:

@@ -80,7 +80,7 @@ def make_seeds(folder: Path) -> dict[str, list[bytes]]:
     seeds["cache"] = [READERS["scene cache"].make_sample(folder)]
     seeds["navmesh"] = [READERS["navmesh"].make_sample(folder)]
     seeds["urdf"] = list(make_robots())
-    seeds["link"] = [make_stl(folder), OBJ, DAE, PLY, binary_ply()]
+    seeds["link"] = [make_stl(folder), DAE, PLY, binary_ply()]
     return seeds
 
 
