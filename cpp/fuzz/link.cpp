@@ -1,6 +1,6 @@
 // SPDX-License-Identifier: Apache-2.0
-// A mesh of a robot's link, whose format is taken from its first bytes. OBJ has a target of its own, with the same checks:
-// assimp sets 16 MB to zero for each such file.
+// A mesh of a robot's link, whose format is taken from its first bytes. OBJ has a target of its own, with the same
+// checks: assimp sets 16 MB to zero for each such file.
 #include <string_view>
 
 #include "reading.hpp"

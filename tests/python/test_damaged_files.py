@@ -13,6 +13,7 @@ import struct
 import subprocess
 import sys
 import time
+import zlib
 from collections.abc import Callable, Sequence
 from pathlib import Path
 from tempfile import TemporaryDirectory
@@ -179,6 +180,19 @@ def test_a_chunk_of_a_picture_is_no_longer_than_its_file(tmp_path: Path) -> None
     write(tmp_path / "m.mtl", MTL)
     (warning,) = plain(write(tmp_path / "m.obj", OBJ)).warnings
     assert "part.png" in warning and "cannot be decoded as PNG (damaged or truncated)" in warning
+
+
+def test_a_picture_of_few_pixels_does_not_inflate_to_many(tmp_path: Path) -> None:
+    whole = png()
+    at = whole.index(b"IDAT")
+    end = at + 4 + int.from_bytes(whole[at - 4 : at], "big")
+    for kilobytes, refused in ((64, False), (64 << 10, True)):
+        pixels = zlib.compress(zlib.decompress(whole[at + 4 : end]) + bytes(kilobytes << 10))
+        chunk = struct.pack(">I", len(pixels)) + b"IDAT" + pixels + struct.pack(">I", zlib.crc32(b"IDAT" + pixels))
+        write(tmp_path / "part.png", whole[: at - 4] + chunk + whole[end + 4 :])
+        write(tmp_path / "m.mtl", MTL)
+        warnings = plain(write(tmp_path / "m.obj", OBJ)).warnings
+        assert ["cannot be decoded" in warning for warning in warnings] == [True] * refused
 
 
 def test_a_picture_without_its_tables_is_not_made_of_what_is_in_memory(tmp_path: Path) -> None:

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What the fuzz targets of the compiled readers begin with: a whole file or more for each, so that damage starts at depth."""
+"""Seeds of the fuzz targets of the compiled readers: whole files, from which damage reaches deep."""
 
 from __future__ import annotations
 

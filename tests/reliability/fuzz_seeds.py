@@ -53,8 +53,11 @@ def make_images() -> Iterator[bytes]:
         yield bytes(cv2.imencode(extension, picture)[1])
     yield bytes(cv2.imencode(".png", picture[..., 0])[1])
     yield bytes(cv2.imencode(".jpg", picture, [cv2.IMWRITE_JPEG_PROGRESSIVE, 1])[1])
-    for kind in (2, 10):  # TGA: plain, and one run of eight pixels a row
-        yield struct.pack("<3B9x2H2B", 0, 0, kind, 8, 8, 24, 0) + (picture.tobytes() if kind == 2 else b"\x87\1\2\3" * 8)
+    for kind, pixels in (
+        (2, picture.tobytes()),
+        (10, b"\x87\1\2\3" * 8),
+    ):  # TGA: plain, and one run of eight pixels a row
+        yield struct.pack("<3B9x2H2B", 0, 0, kind, 8, 8, 24, 0) + pixels
     yield (DATA / "wall.ktx2").read_bytes()
     yield (DATA / "wall_etc1s.basis").read_bytes()
 

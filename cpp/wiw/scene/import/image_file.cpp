@@ -133,6 +133,8 @@ Texture decode_image(std::string name, Bytes bytes, const BasisDecoder& decode_b
   if (is_webp(bytes)) return decode_webp(std::move(name), bytes);
   if (is_basis(bytes)) return decode_with(decode_basis, std::move(name), bytes);
   if (is_png(bytes)) check_png_chunks(bytes);
+  // Buffers double: twice the file, twice 16 bits of RGBA, and what small pictures have beside their pixels.
+  bound_stb_buffers(2 * bytes.size() + 16 * image_size(bytes).pixels() + (std::size_t{1} << 20));
   Size size;
   int channels = 0;
   std::shared_ptr<const std::uint8_t> pixels(
