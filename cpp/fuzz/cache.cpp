@@ -29,13 +29,9 @@ std::string join(const std::vector<std::string>& parts) {
   return bytes + parts[0] + parts[1];
 }
 
-const wiw::fuzz::Container kCache{.split = split, .join = join};
-
 }  // namespace
 
-extern "C" std::size_t LLVMFuzzerCustomMutator(std::uint8_t* data, std::size_t size, std::size_t most, unsigned seed) {
-  return wiw::fuzz::mutate_container(kCache, {data, most}, size, seed);
-}
+wiw::fuzz::Container wiw::fuzz::container() { return {.split = split, .join = join}; }
 
 extern "C" int LLVMFuzzerTestOneInput(const std::uint8_t* data, std::size_t size) {
   static const wiw::fuzz::Folder folder;

@@ -65,20 +65,4 @@ std::string mutate_json(std::string text, std::size_t most, Rng& rng) {
   return text;
 }
 
-std::size_t mutate_container(const Container& container, std::span<std::uint8_t> buffer, std::size_t size,
-                             unsigned seed) {
-  Rng rng(seed);
-  const std::string whole(buffer.begin(), buffer.begin() + static_cast<std::ptrdiff_t>(size));
-  std::vector<std::string> parts = container.split(whole);
-  if (parts.empty() || rng.chance(0.05)) return LLVMFuzzerMutate(buffer.data(), size, buffer.size());
-  const std::size_t which = below(rng, parts.size());
-  const std::size_t most = parts[which].size() + buffer.size() - std::min(size, buffer.size());
-  const bool is_json = static_cast<int>(which) == container.json;
-  parts[which] = is_json ? mutate_json(parts[which], most, rng) : mutate_bytes(parts[which], most);
-  const std::string mutated = container.join(parts);
-  if (mutated.size() > buffer.size()) return LLVMFuzzerMutate(buffer.data(), size, buffer.size());
-  std::ranges::copy(mutated, buffer.begin());
-  return mutated.size();
-}
-
 }  // namespace wiw::fuzz

@@ -4,7 +4,6 @@
 #include <cstddef>
 #include <cstdint>
 #include <functional>
-#include <span>
 #include <string>
 #include <vector>
 
@@ -28,9 +27,8 @@ struct Container {
   int json = -1;
 };
 
-/// For LLVMFuzzerCustomMutator: mutates a part of the file, or now and then the whole; returns the new size.
-std::size_t mutate_container(const Container& container, std::span<std::uint8_t> buffer, std::size_t size,
-                             unsigned seed);
+/// The format of a target that is linked with container_mutator.cpp, which defines it.
+Container container();
 
 /// A little-endian number in a file's header.
 template <class T>

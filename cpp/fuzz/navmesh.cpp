@@ -22,8 +22,6 @@ std::string join(const std::vector<std::string>& parts) {
   return bytes + parts[1];
 }
 
-const wiw::fuzz::Container kNavmesh{.split = split, .join = join};
-
 void query(const wiw::nav::NavMesh& mesh) {
   const std::vector<Eigen::Vector3f> points = mesh.sample(3, 1, -1);
   for (const auto metric : {wiw::nav::Metric::kExact, wiw::nav::Metric::kDetour, wiw::nav::Metric::kDetourUncapped}) {
@@ -37,9 +35,7 @@ void query(const wiw::nav::NavMesh& mesh) {
 
 }  // namespace
 
-extern "C" std::size_t LLVMFuzzerCustomMutator(std::uint8_t* data, std::size_t size, std::size_t most, unsigned seed) {
-  return wiw::fuzz::mutate_container(kNavmesh, {data, most}, size, seed);
-}
+wiw::fuzz::Container wiw::fuzz::container() { return {.split = split, .join = join}; }
 
 extern "C" int LLVMFuzzerTestOneInput(const std::uint8_t* data, std::size_t size) {
   static const wiw::fuzz::Folder folder;
