@@ -211,6 +211,19 @@ def test_a_picture_without_its_tables_is_not_made_of_what_is_in_memory(tmp_path:
     assert caches[0] == caches[1]
 
 
+@pytest.mark.parametrize("count", [b"11336627045591300324", b"-1", b"4", b"3.5"])
+def test_a_face_has_the_corners_that_it_announces(tmp_path: Path, count: bytes) -> None:
+    """What is announced is refused before memory is taken for it."""
+    mesh = write(tmp_path / "m.ply", PLY.replace(b"3 1 3 2", count + b" 1 3 2"))
+    with pytest.raises(FileError, match=r"m\.ply: face 1 has fewer entries than it says"):
+        plain(mesh)
+
+
+def test_lists_are_counted_in_whole_numbers(tmp_path: Path) -> None:
+    with pytest.raises(FileError, match=r"m\.ply: has a property of unknown type"):
+        plain(write(tmp_path / "m.ply", PLY.replace(b"list uchar", b"list float")))
+
+
 @pytest.mark.parametrize(("row", "name"), [("vertex 0", "red"), ("face 1", "object_id")])
 def test_labels_and_colours_that_are_no_numbers_are_refused(tmp_path: Path, row: str, name: str) -> None:
     head = PLY[: PLY.index(b"element face")].replace(b"ascii", b"binary_little_endian")
