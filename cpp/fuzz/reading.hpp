@@ -38,14 +38,15 @@ class Folder {
   std::filesystem::path path_;
 };
 
-/// Calls `read`, which may refuse the file by an error of wiw's own that names it; anything else ends the process.
+/// Calls `read`, which may refuse the file by an error of wiw's own that names it, or one beside it; anything else ends
+/// the process.
 template <class Read>
 void read_or_refuse(const std::filesystem::path& file, const Read& read) {
   try {
     read(file);
   } catch (const Error& error) {
-    if (std::string(error.what()).find(file.filename().string()) != std::string::npos) return;
-    std::fprintf(stderr, "the error does not name the file: %s\n", error.what());
+    if (std::string(error.what()).find(file.parent_path().string()) != std::string::npos) return;
+    std::fprintf(stderr, "the error names no file: %s\n", error.what());
     std::abort();
   }
 }

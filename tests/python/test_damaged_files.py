@@ -219,6 +219,27 @@ def test_a_face_has_the_corners_that_it_announces(tmp_path: Path, count: bytes) 
         plain(mesh)
 
 
+@pytest.mark.parametrize(
+    ("part", "damaged", "words"),
+    [
+        (b'offset="0"', b'offset="07777777777777777777"', "<triangles> element announces 3"),
+        (b'triangles count="1"', b'triangles count="99999999"', "<triangles> element announces 299999997"),
+        (b'count="9"', b'count="99999999"', "<float_array> element announces 99999999"),
+    ],
+)
+def test_a_collada_file_has_the_numbers_that_it_announces(
+    tmp_path: Path, part: bytes, damaged: bytes, words: str
+) -> None:
+    with pytest.raises(FileError, match=rf"m\.dae: a {words} values or points, but has at most"):
+        plain(write(tmp_path / "m.dae", DAE.replace(part, damaged)))
+
+
+def test_a_mesh_of_a_world_that_is_a_folder_is_left_out(tmp_path: Path) -> None:
+    mesh = b"</geometry></visual><visual name='w'><geometry><mesh/></geometry></visual>"
+    (warning,) = plain(write(tmp_path / "m.sdf", SDF.replace(b"</geometry></visual>", mesh))).warnings
+    assert "mesh '' was not found" in warning
+
+
 def test_lists_are_counted_in_whole_numbers(tmp_path: Path) -> None:
     with pytest.raises(FileError, match=r"m\.ply: has a property of unknown type"):
         plain(write(tmp_path / "m.ply", PLY.replace(b"list uchar", b"list float")))
