@@ -240,6 +240,18 @@ def test_a_mesh_of_a_world_that_is_a_folder_is_left_out(tmp_path: Path) -> None:
     assert "mesh '' was not found" in warning
 
 
+def test_two_arrays_of_a_collada_file_with_one_name_are_taken_for_the_shorter(tmp_path: Path) -> None:
+    """assimp, which leaves out geometries in geometries, reads beyond the one that it has found."""
+    other = (
+        b'<geometry id="h"><mesh><source id="q"><float_array id="a" count="9">0 0 0 1 0 0 0 1 0</float_array></source>'
+    )
+    nested = DAE.replace(b"</mesh></geometry>", b"</mesh>" + other + b"</source></mesh></geometry></geometry>")
+    short = nested.replace(b'count="9">0 0 0 1 0 0 0 1 0\n', b'count="0">\n', 1)
+    assert short != nested and plain(write(tmp_path / "m.dae", nested)).triangle_count == 1
+    with pytest.raises(FileError, match=r"m\.dae: an <accessor> reads 3 x 3 values of '#a', which has 0"):
+        plain(write(tmp_path / "m.dae", short))
+
+
 def test_lists_are_counted_in_whole_numbers(tmp_path: Path) -> None:
     with pytest.raises(FileError, match=r"m\.ply: has a property of unknown type"):
         plain(write(tmp_path / "m.ply", PLY.replace(b"list uchar", b"list float")))

@@ -82,7 +82,9 @@ class Walker : public pugi::xml_tree_walker {
 void check_accessors(const pugi::xml_document& document, const std::string& path) {
   std::map<std::string, std::uint64_t> counts;
   for (const pugi::xpath_node& array : document.select_nodes("//float_array | //Name_array | //IDREF_array")) {
-    counts[array.node().attribute("id").value()] = array.node().attribute("count").as_ullong();
+    const std::uint64_t count = array.node().attribute("count").as_ullong();
+    const auto [first, is_new] = counts.try_emplace(array.node().attribute("id").value(), count);
+    if (!is_new) first->second = std::min(first->second, count);  // assimp may have read either
   }
   for (const pugi::xpath_node& found : document.select_nodes("//accessor")) {
     const pugi::xml_node accessor = found.node();
