@@ -57,6 +57,9 @@ class Walker : public pugi::xml_tree_walker {
         throw FileError(path_, "a <" + std::string(node.name()) + "> element has no attribute '" +
                                    requirement.attribute + "' (damaged file)");
       }
+      if (lies_in_its_like(node)) {
+        throw FileError(path_, "a <" + std::string(node.name()) + "> element lies in another one (damaged file)");
+      }
     }
     const std::string_view name = node.name();
     const bool is_list = name == "p" || name == "h" || name == "vcount" || name == "v";
@@ -68,6 +71,13 @@ class Walker : public pugi::xml_tree_walker {
   }
 
  private:
+  /// No element that assimp goes by does so in the schema.
+  static bool lies_in_its_like(const pugi::xml_node& node) {
+    pugi::xml_node above = node.parent();
+    while (above && std::string_view(above.name()) != node.name()) above = above.parent();
+    return !above.empty();
+  }
+
   /// The schema reuses a few names: <source> and <param> inside samplers and surfaces hold plain text.
   static bool is_other_use(const pugi::xml_node& node) {
     const std::string_view name = node.name();
