@@ -255,6 +255,13 @@ def test_two_arrays_of_a_collada_file_with_one_name_are_taken_for_the_shorter(tm
         plain(write(tmp_path / "m.dae", DAE.replace(b"<source ", other + b"<source ", 1)))
 
 
+@pytest.mark.parametrize("end", [b"\0", b"\f", b"\r"])
+def test_rows_of_a_text_end_where_lines_do(tmp_path: Path, end: bytes) -> None:
+    with pytest.raises(FileError, match=r"m\.ply: has bytes that no text has"):
+        plain(write(tmp_path / "m.ply", PLY.replace(b"1 0 0", b"1 0 0" + end + b"5")))
+    assert plain(write(tmp_path / "m.ply", PLY.replace(b"\n", b"\r\n"))).triangle_count == 2
+
+
 def test_lists_are_counted_in_whole_numbers(tmp_path: Path) -> None:
     with pytest.raises(FileError, match=r"m\.ply: has a property of unknown type"):
         plain(write(tmp_path / "m.ply", PLY.replace(b"list uchar", b"list float")))

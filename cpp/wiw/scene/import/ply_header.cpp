@@ -19,7 +19,8 @@
 namespace wiw::scene {
 namespace {
 
-constexpr std::size_t kMostEntries = 1 << 16;  // of one face; more is damage
+constexpr std::string_view kLineEnds("\0\f\r", 3);  // of assimp's, beside the newline
+constexpr std::size_t kMostEntries = 1 << 16;       // of one face; more is damage
 
 std::size_t bytes_of(const std::string& type) {
   struct TypeSize {
@@ -140,6 +141,14 @@ std::string_view take_row(std::string_view& body) {
   return line;
 }
 
+/// Whether lines end as they do here for assimp, too, which also ends them at NUL, form feed and lone carriage returns.
+bool has_plain_lines(std::string_view body) {
+  for (std::size_t at = body.find_first_of(kLineEnds); at < body.size(); at = body.find_first_of(kLineEnds, at + 1)) {
+    if (body[at] != '\r' || !body.substr(at + 1).starts_with('\n')) return false;
+  }
+  return true;
+}
+
 void check_ascii(const PlyHeader& header, std::string_view file, const std::string& path) {
   std::size_t rows = 0;
   for (const PlyElement& element : header.elements) rows += element.count;
@@ -150,6 +159,7 @@ void check_ascii(const PlyHeader& header, std::string_view file, const std::stri
     throw FileError(
         path, "should have " + std::to_string(rows) + " rows but has " + std::to_string(lines) + " (truncated file)");
   }
+  if (!has_plain_lines(body)) throw FileError(path, "has bytes that no text has (damaged file)");
   for (const PlyElement& element : header.elements) {
     for (std::size_t row = 0; row < element.count; ++row) {
       if (has_entries(element, take_row(body))) continue;
