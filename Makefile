@@ -1,6 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
 # make demo | test | bench | lint | wheel    each does all the set-up it needs (Debian packages, .venv, build).
-.PHONY: help setup demo test bench nightly lint wheel sanitize clean
+.PHONY: help setup demo test bench nightly lint wheel sanitize fuzz clean
 .DEFAULT_GOAL := help
 BIN := .venv/bin
 TESTS := build/tests
@@ -43,6 +43,10 @@ wheel:      ## a self-contained wheel in dist/
 sanitize:   ## C++ tests under ASAN+UBSAN and under TSAN
 	@scripts/setup
 	scripts/sanitize
+
+fuzz:       ## the compiled readers fuzzed by libFuzzer under ASAN+UBSAN, a minute each (needs Clang 19)
+	@scripts/setup test
+	scripts/fuzz_compiled
 
 clean:
 	rm -rf build dist

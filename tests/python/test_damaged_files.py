@@ -3,6 +3,7 @@
 
 from __future__ import annotations
 
+import ctypes
 import json
 import os
 import random
@@ -12,6 +13,7 @@ import struct
 import subprocess
 import sys
 import time
+import zlib
 from collections.abc import Callable, Sequence
 from pathlib import Path
 from tempfile import TemporaryDirectory
@@ -24,7 +26,7 @@ from glb import Glb
 from test_gltf import DATA, DRACO, compressed_bumps, draco_glb, save, save_compressed
 
 import wiw
-from wiw import process_limits, scenes
+from wiw import _core, process_limits, scenes
 from wiw.errors import Error, FileError, InfrastructureError
 from wiw.physics import Articulation, read_surface
 from wiw.scenes import isolated
@@ -63,6 +65,8 @@ SDF = b"""<?xml version="1.0"?><sdf version="1.7"><world name="w"><model name="p
 <geometry><box><size>1 1 1</size></box></geometry></visual></link></model></world></sdf>"""
 OBJ = b"mtllib m.mtl\no part\nusemtl part\nv 0 0 0\nv 1 0 0\nv 0 1 0\nf 1 2 3\n"
 MTL = b"newmtl part\nKd 1 0 0\nmap_Kd part.png\n"
+M_PERTURB = -6
+"""The option of glibc's mallopt that fills new memory with a byte, which is given inverted."""
 URDF = """<robot name="r"><link name="a"><visual><geometry>{shape}</geometry>{material}</visual></link></robot>"""
 
 
@@ -155,6 +159,125 @@ def test_a_damaged_picture_costs_the_picture_alone(tmp_path: Path) -> None:
         write(tmp_path / "m.mtl", MTL)
         (warning,) = plain(write(tmp_path / "m.obj", OBJ)).warnings
         assert "part.png" in warning and "cannot be decoded" in warning
+
+
+def without_segments(jpeg: bytes, marker: int) -> bytes:
+    """Return a JPEG file without its segments of a kind."""
+    kept, at = jpeg[:2], 2
+    while jpeg[at + 1] != 0xDA:  # the scan, which goes on to the end
+        end = at + 2 + int.from_bytes(jpeg[at + 2 : at + 4], "big")
+        kept += jpeg[at:end] if jpeg[at + 1] != marker else b""
+        at = end
+    return kept + jpeg[at:]
+
+
+def test_a_chunk_of_a_picture_is_no_longer_than_its_file(tmp_path: Path) -> None:
+    """It is refused before memory is taken for it."""
+    damaged = bytearray(png())
+    at = damaged.index(b"IDAT")
+    damaged[at - 4 : at] = struct.pack(">I", 1 << 29)
+    write(tmp_path / "part.png", bytes(damaged))
+    write(tmp_path / "m.mtl", MTL)
+    (warning,) = plain(write(tmp_path / "m.obj", OBJ)).warnings
+    assert "part.png" in warning and "cannot be decoded as PNG (damaged or truncated)" in warning
+
+
+def test_a_picture_of_few_pixels_does_not_inflate_to_many(tmp_path: Path) -> None:
+    whole = png()
+    at = whole.index(b"IDAT")
+    end = at + 4 + int.from_bytes(whole[at - 4 : at], "big")
+    for kilobytes, refused in ((64, False), (64 << 10, True)):
+        pixels = zlib.compress(zlib.decompress(whole[at + 4 : end]) + bytes(kilobytes << 10))
+        chunk = struct.pack(">I", len(pixels)) + b"IDAT" + pixels + struct.pack(">I", zlib.crc32(b"IDAT" + pixels))
+        write(tmp_path / "part.png", whole[: at - 4] + chunk + whole[end + 4 :])
+        write(tmp_path / "m.mtl", MTL)
+        warnings = plain(write(tmp_path / "m.obj", OBJ)).warnings
+        assert ["cannot be decoded" in warning for warning in warnings] == [True] * refused
+
+
+def test_a_picture_without_its_tables_is_not_made_of_what_is_in_memory(tmp_path: Path) -> None:
+    jpeg = bytes(cv2.imencode(".jpg", np.arange(192, dtype=np.uint8).reshape(8, 8, 3))[1])
+    write(tmp_path / "part.png", without_segments(jpeg, 0xC4))
+    write(tmp_path / "m.mtl", MTL)
+    write(tmp_path / "m.obj", OBJ)
+    caches = []
+    try:
+        for fill in (3, 1):
+            ctypes.CDLL(None).mallopt(M_PERTURB, ~fill & 0xFF)
+            _core.scene.write_cache(plain(tmp_path / "m.obj"), tmp_path / "cache")
+            caches.append((tmp_path / "cache").read_bytes())
+    finally:
+        ctypes.CDLL(None).mallopt(M_PERTURB, 0)
+    assert caches[0] == caches[1]
+
+
+@pytest.mark.parametrize("count", [b"11336627045591300324", b"-1", b"4", b"3.5"])
+def test_a_face_has_the_corners_that_it_announces(tmp_path: Path, count: bytes) -> None:
+    """What is announced is refused before memory is taken for it."""
+    mesh = write(tmp_path / "m.ply", PLY.replace(b"3 1 3 2", count + b" 1 3 2"))
+    with pytest.raises(FileError, match=r"m\.ply: face 1 has fewer entries than it says"):
+        plain(mesh)
+
+
+@pytest.mark.parametrize(
+    ("part", "damaged", "words"),
+    [
+        (b'offset="0"', b'offset="07777777777777777777"', "<triangles> element announces 3"),
+        (b'triangles count="1"', b'triangles count="99999999"', "<triangles> element announces 299999997"),
+        (b'count="9"', b'count="99999999"', "<float_array> element announces 99999999"),
+    ],
+)
+def test_a_collada_file_has_the_numbers_that_it_announces(
+    tmp_path: Path, part: bytes, damaged: bytes, words: str
+) -> None:
+    with pytest.raises(FileError, match=rf"m\.dae: a {words} values or points, but has at most"):
+        plain(write(tmp_path / "m.dae", DAE.replace(part, damaged)))
+
+
+def test_a_mesh_of_a_world_that_is_a_folder_is_left_out(tmp_path: Path) -> None:
+    mesh = b"</geometry></visual><visual name='w'><geometry><mesh/></geometry></visual>"
+    (warning,) = plain(write(tmp_path / "m.sdf", SDF.replace(b"</geometry></visual>", mesh))).warnings
+    assert "mesh '' was not found" in warning
+
+
+def test_geometries_in_geometries_of_a_collada_file_are_refused(tmp_path: Path) -> None:
+    """assimp finds them by some of its paths and not by others, and reads arrays beyond their ends."""
+    inner = DAE[DAE.index(b"<geometry ") : DAE.index(b"</library_geometries>")]
+    mesh = write(tmp_path / "m.dae", DAE.replace(b"</mesh></geometry>", b"</mesh>" + inner + b"</geometry>"))
+    with pytest.raises(FileError, match=r"m\.dae: a <geometry> element lies in another one"):
+        plain(mesh)
+
+
+def test_two_arrays_of_a_collada_file_with_one_name_are_taken_for_the_shorter(tmp_path: Path) -> None:
+    source = DAE[DAE.index(b"<source ") : DAE.index(b"<technique_common>")] + b"</source>"
+    other = source.replace(b'id="p"', b'id="q"').replace(b'count="9"', b'count="8"')
+    with pytest.raises(FileError, match=r"m\.dae: an <accessor> reads 3 x 3 values of '#a', which has 8"):
+        plain(write(tmp_path / "m.dae", DAE.replace(b"<source ", other + b"<source ", 1)))
+
+
+@pytest.mark.parametrize("end", [b"\0", b"\f", b"\r"])
+def test_rows_of_a_text_end_where_lines_do(tmp_path: Path, end: bytes) -> None:
+    with pytest.raises(FileError, match=r"m\.ply: has bytes that no text has"):
+        plain(write(tmp_path / "m.ply", PLY.replace(b"1 0 0", b"1 0 0" + end + b"5")))
+    assert plain(write(tmp_path / "m.ply", PLY.replace(b"\n", b"\r\n"))).triangle_count == 2
+
+
+def test_lists_are_counted_in_whole_numbers(tmp_path: Path) -> None:
+    with pytest.raises(FileError, match=r"m\.ply: has a property of unknown type"):
+        plain(write(tmp_path / "m.ply", PLY.replace(b"list uchar", b"list float")))
+
+
+@pytest.mark.parametrize(("row", "name"), [("vertex 0", "red"), ("face 1", "object_id")])
+def test_labels_and_colours_that_are_no_numbers_are_refused(tmp_path: Path, row: str, name: str) -> None:
+    head = PLY[: PLY.index(b"element face")].replace(b"ascii", b"binary_little_endian")
+    colours = b"".join(b"property float %s\n" % channel for channel in (b"red", b"green", b"blue"))
+    list_line = b"element face 2\nproperty list uchar int vertex_indices\nproperty double object_id\nend_header\n"
+    corners = np.concatenate([SQUARE, np.full((4, 3), np.nan if name == "red" else 1)], 1, dtype=np.float32)
+    label = np.nan if name == "object_id" else 2
+    faces = b"".join(struct.pack("<B3id", 3, *face, value) for face, value in zip(TWO, (1, label), strict=True))
+    mesh = write(tmp_path / "m.ply", head + colours + list_line + corners.tobytes() + faces)
+    with pytest.raises(FileError, match=rf"m\.ply: {row} has a '{name}' that is not a number"):
+        _core.scene.read_ply_surface(mesh, "object_id")
 
 
 # ---- robots

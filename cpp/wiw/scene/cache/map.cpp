@@ -66,7 +66,7 @@ class CacheReader {
     value(checksum);
     texels(buffer);
     const auto* first = reinterpret_cast<const std::uint8_t*>(buffer.data());
-    if (cache::array_checksum({first, buffer.size() * sizeof(T)}) != checksum) {
+    if (!cache::fits(cache::array_checksum({first, buffer.size() * sizeof(T)}), checksum)) {
       throw Error("the checksum of an array does not fit");
     }
   }
@@ -118,7 +118,7 @@ cache::CacheHeader checked_header(std::span<const std::uint8_t> file) {
     throw Error("it should have " + std::to_string(header.file_bytes) + " bytes but has " +
                 std::to_string(file.size()));
   }
-  if (cache::checksum(header, file.subspan(header.table_offset)) != header.checksum)
+  if (!cache::fits(cache::checksum(header, file.subspan(header.table_offset)), header.checksum))
     throw Error("its checksum does not fit");
   return header;
 }

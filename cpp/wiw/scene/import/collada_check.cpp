@@ -3,6 +3,7 @@
 
 #include <algorithm>
 #include <array>
+#include <charconv>
 #include <cstdint>
 #include <map>
 #include <pugixml.hpp>
@@ -56,6 +57,9 @@ class Walker : public pugi::xml_tree_walker {
         throw FileError(path_, "a <" + std::string(node.name()) + "> element has no attribute '" +
                                    requirement.attribute + "' (damaged file)");
       }
+      if (lies_in_its_like(node)) {
+        throw FileError(path_, "a <" + std::string(node.name()) + "> element lies in another one (damaged file)");
+      }
     }
     const std::string_view name = node.name();
     const bool is_list = name == "p" || name == "h" || name == "vcount" || name == "v";
@@ -67,6 +71,13 @@ class Walker : public pugi::xml_tree_walker {
   }
 
  private:
+  /// No element that assimp goes by does so in the schema.
+  static bool lies_in_its_like(const pugi::xml_node& node) {
+    pugi::xml_node above = node.parent();
+    while (above && std::string_view(above.name()) != node.name()) above = above.parent();
+    return !above.empty();
+  }
+
   /// The schema reuses a few names: <source> and <param> inside samplers and surfaces hold plain text.
   static bool is_other_use(const pugi::xml_node& node) {
     const std::string_view name = node.name();
@@ -81,7 +92,9 @@ class Walker : public pugi::xml_tree_walker {
 void check_accessors(const pugi::xml_document& document, const std::string& path) {
   std::map<std::string, std::uint64_t> counts;
   for (const pugi::xpath_node& array : document.select_nodes("//float_array | //Name_array | //IDREF_array")) {
-    counts[array.node().attribute("id").value()] = array.node().attribute("count").as_ullong();
+    const std::uint64_t count = array.node().attribute("count").as_ullong();
+    const auto [first, is_new] = counts.try_emplace(array.node().attribute("id").value(), count);
+    if (!is_new) first->second = std::min(first->second, count);  // assimp may have read either
   }
   for (const pugi::xpath_node& found : document.select_nodes("//accessor")) {
     const pugi::xml_node accessor = found.node();
@@ -99,6 +112,72 @@ void check_accessors(const pugi::xml_document& document, const std::string& path
     }
   }
 }
+
+/// Characters of the children of a name, of which a list needs one for each number.
+std::uint64_t length_of(const pugi::xml_node& element, const char* child) {
+  std::uint64_t length = 0;
+  for (const pugi::xml_node& list : element.children(child)) length += std::string_view(list.child_value()).size();
+  return length;
+}
+
+std::uint64_t sum_of(std::string_view numbers) {
+  std::uint64_t sum = 0;
+  while (!numbers.empty()) {
+    std::uint32_t number = 0;
+    const auto [rest, error] = std::from_chars(numbers.data(), numbers.data() + numbers.size(), number);
+    sum += error == std::errc::result_out_of_range ? UINT32_MAX : number;
+    numbers.remove_prefix(std::max<std::size_t>(1, static_cast<std::size_t>(rest - numbers.data())));
+  }
+  return sum;
+}
+
+/// assimp takes memory for as many numbers as an element announces.
+class Announcements {
+ public:
+  Announcements(const pugi::xml_document& document, std::string path) : document_(document), path_(std::move(path)) {}
+
+  void check() const {
+    for_each("//float_array | //Name_array | //IDREF_array", [&](const pugi::xml_node& array) {
+      compare(array, count_of(array), std::string_view(array.child_value()).size());
+    });
+    for_each("//triangles", [&](const pugi::xml_node& part) { check_points(part, 3 * count_of(part)); });
+    for_each("//lines", [&](const pugi::xml_node& part) { check_points(part, 2 * count_of(part)); });
+    for_each("//polylist", [&](const pugi::xml_node& part) {
+      compare(part, count_of(part), length_of(part, "vcount"));
+      check_points(part, sum_of(part.child_value("vcount")));
+    });
+    for_each("//vertex_weights", [&](const pugi::xml_node& part) {
+      compare(part, count_of(part), length_of(part, "vcount"));
+      compare(part, sum_of(part.child_value("vcount")), length_of(part, "v"));
+    });
+  }
+
+ private:
+  static std::uint64_t count_of(const pugi::xml_node& element) { return element.attribute("count").as_uint(); }
+
+  template <class Use>
+  void for_each(const char* path, const Use& use) const {
+    for (const pugi::xpath_node& found : document_.select_nodes(path)) use(found.node());
+  }
+
+  /// Each point has an index for each offset of an input.
+  void check_points(const pugi::xml_node& part, std::uint64_t points) const {
+    std::uint64_t indices = 1;
+    for (const pugi::xml_node& input : part.children("input")) {
+      indices = std::max(indices, std::uint64_t{input.attribute("offset").as_uint()} + 1);
+    }
+    compare(part, points, length_of(part, "p") / indices);
+  }
+
+  void compare(const pugi::xml_node& element, std::uint64_t announced, std::uint64_t most) const {
+    if (announced <= most) return;
+    throw FileError(path_, "a <" + std::string(element.name()) + "> element announces " + std::to_string(announced) +
+                               " values or points, but has at most " + std::to_string(most) + " (damaged file)");
+  }
+
+  const pugi::xml_document& document_;
+  std::string path_;
+};
 
 /// Nodes may show other nodes; assimp copies these, and calls itself, for as long as there are any.
 class Instances {
@@ -150,6 +229,7 @@ void check_collada(const std::filesystem::path& path) {
   }
   Walker walker(path.string());
   document.traverse(walker);
+  Announcements(document, path.string()).check();
   check_accessors(document, path.string());
   Instances(document, path.string()).check(document);
 }

@@ -32,6 +32,25 @@ bool begins_with(Bytes bytes, Bytes begin, std::size_t at = 0) {
   return bytes.size() >= at + begin.size() && std::ranges::equal(bytes.subspan(at, begin.size()), begin);
 }
 
+bool is_png(Bytes bytes) {
+  constexpr std::array<std::uint8_t, 4> kPng{0x89, 'P', 'N', 'G'};
+  return begins_with(bytes, kPng);
+}
+
+/// stb takes memory for a chunk before it looks whether the file has as much.
+void check_png_chunks(Bytes bytes) {
+  constexpr std::size_t kSignature = 8, kChunkHeader = 8, kChecksum = 4;
+  constexpr std::array<std::uint8_t, 4> kEnd{'I', 'E', 'N', 'D'};
+  for (std::size_t at = kSignature; at + kChunkHeader <= bytes.size();) {
+    if (begins_with(bytes, kEnd, at + 4)) return;
+    std::size_t length = 0;
+    for (const std::uint8_t byte : bytes.subspan(at, 4)) length = length << 8 | byte;
+    at += kChunkHeader;
+    if (length > bytes.size() - at) throw Error("cannot be decoded as PNG (damaged or truncated)");
+    at += length + kChecksum;
+  }
+}
+
 bool is_ktx2(Bytes bytes) { return begins_with(bytes, kKtx2); }
 
 bool is_webp(Bytes bytes) {
@@ -113,6 +132,9 @@ Size image_size(Bytes bytes) {
 Texture decode_image(std::string name, Bytes bytes, const BasisDecoder& decode_basis) {
   if (is_webp(bytes)) return decode_webp(std::move(name), bytes);
   if (is_basis(bytes)) return decode_with(decode_basis, std::move(name), bytes);
+  if (is_png(bytes)) check_png_chunks(bytes);
+  // Buffers double: twice the file, twice 16 bits of RGBA, and what small pictures have beside their pixels.
+  bound_stb_buffers(2 * bytes.size() + 16 * image_size(bytes).pixels() + (std::size_t{1} << 20));
   Size size;
   int channels = 0;
   std::shared_ptr<const std::uint8_t> pixels(

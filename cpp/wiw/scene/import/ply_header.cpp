@@ -4,6 +4,7 @@
 #include <algorithm>
 #include <array>
 #include <bit>
+#include <charconv>
 #include <cstdint>
 #include <cstring>
 #include <set>
@@ -18,7 +19,8 @@
 namespace wiw::scene {
 namespace {
 
-constexpr std::size_t kMostEntries = 1 << 16;  // of one face; more is damage
+constexpr std::string_view kLineEnds("\0\f\r", 3);  // of assimp's, beside the newline
+constexpr std::size_t kMostEntries = 1 << 16;       // of one face; more is damage
 
 std::size_t bytes_of(const std::string& type) {
   struct TypeSize {
@@ -44,6 +46,8 @@ std::size_t bytes_of(const std::string& type) {
   const auto* row = std::ranges::find(kTypes, type, &TypeSize::name);
   return row == kTypes.end() ? 0 : row->bytes;
 }
+
+bool is_whole(std::string_view type) { return !type.starts_with("float") && !type.starts_with("double"); }
 
 /// assimp gives each vertex and face its place by the element's count, so it must meet each element once, and faces
 /// after the vertices that they name.
@@ -103,15 +107,65 @@ void check_binary(const PlyHeader& header, std::string_view file, const std::str
   }
 }
 
+std::string_view take_token(std::string_view& line) {
+  constexpr std::string_view kSpace = " \t\r";
+  line.remove_prefix(std::min(line.find_first_not_of(kSpace), line.size()));
+  const std::string_view token = line.substr(0, line.find_first_of(kSpace));
+  line.remove_prefix(token.size());
+  return token;
+}
+
+/// Whether a row has the entries that its lists announce: assimp takes memory for as many as are announced.
+bool has_entries(const PlyElement& element, std::string_view line) {
+  for (const PlyProperty& property : element.properties) {
+    const std::string_view token = take_token(line);
+    if (property.count_bytes == 0) continue;
+    std::size_t entries = 0;
+    const auto [rest, error] = std::from_chars(token.data(), token.data() + token.size(), entries);
+    if (error != std::errc() || rest != token.data() + token.size()) return false;
+    for (; entries > 0; --entries) {
+      if (take_token(line).empty()) return false;
+    }
+  }
+  return true;
+}
+
+/// The next line that is neither empty nor a comment.
+std::string_view take_row(std::string_view& body) {
+  std::string_view line;
+  while (!body.empty() && (line.empty() || line.starts_with("comment"))) {
+    line = body.substr(0, body.find('\n'));
+    body.remove_prefix(std::min(line.size() + 1, body.size()));
+    line.remove_suffix(line.ends_with('\r') ? 1 : 0);
+  }
+  return line;
+}
+
+/// Whether lines end as they do here for assimp, too, which also ends them at NUL, form feed and lone carriage returns.
+bool has_plain_lines(std::string_view body) {
+  for (std::size_t at = body.find_first_of(kLineEnds); at < body.size(); at = body.find_first_of(kLineEnds, at + 1)) {
+    if (body[at] != '\r' || !body.substr(at + 1).starts_with('\n')) return false;
+  }
+  return true;
+}
+
 void check_ascii(const PlyHeader& header, std::string_view file, const std::string& path) {
   std::size_t rows = 0;
   for (const PlyElement& element : header.elements) rows += element.count;
-  const auto body = file.substr(header.bytes);
+  auto body = file.substr(header.bytes);
   const auto lines =
       static_cast<std::size_t>(std::ranges::count(body, '\n')) + (body.empty() || body.back() == '\n' ? 0 : 1);
   if (rows > lines) {
     throw FileError(
         path, "should have " + std::to_string(rows) + " rows but has " + std::to_string(lines) + " (truncated file)");
+  }
+  if (!has_plain_lines(body)) throw FileError(path, "has bytes that no text has (damaged file)");
+  for (const PlyElement& element : header.elements) {
+    for (std::size_t row = 0; row < element.count; ++row) {
+      if (has_entries(element, take_row(body))) continue;
+      throw FileError(path,
+                      element.name + " " + std::to_string(row) + " has fewer entries than it says (damaged file)");
+    }
   }
 }
 
@@ -149,7 +203,7 @@ PlyHeader read_ply_header(std::string_view file, const std::string& path) {
       PlyProperty property;
       if (type == "list") {
         line >> count_type >> type;
-        property.count_bytes = bytes_of(count_type);
+        property.count_bytes = is_whole(count_type) ? bytes_of(count_type) : 0;
       }
       line >> property.name;
       property.type = type;

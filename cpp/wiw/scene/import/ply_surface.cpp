@@ -4,6 +4,7 @@
 #include <algorithm>
 #include <array>
 #include <bit>
+#include <cmath>
 #include <cstring>
 #include <optional>
 #include <string_view>
@@ -78,6 +79,13 @@ bool has(const PlyElement& element, std::string_view name, bool is_list = false)
   });
 }
 
+void check_number(double number, const std::string& path, const char* row, std::size_t index,
+                  const PlyProperty& property) {
+  if (!std::isnan(number)) return;
+  throw FileError(path, std::string(row) + " " + std::to_string(index) + " has a '" + property.name +
+                            "' that is not a number (damaged file)");
+}
+
 void read_vertices(const PlyElement& element, PlyBody& body, const std::string& path, PlySurface& surface) {
   for (const std::string_view axis : kAxes) {
     if (!has(element, axis)) throw FileError(path, "has vertices without " + std::string(axis));
@@ -96,6 +104,7 @@ void read_vertices(const PlyElement& element, PlyBody& body, const std::string& 
       const double number = body.number(property.type);
       if (axis) surface.vertices[i][static_cast<int>(*axis)] = static_cast<float>(number);
       if (channel) {
+        check_number(number, path, "vertex", i, property);
         surface.colors[i][static_cast<int>(*channel)] = static_cast<std::uint8_t>(std::clamp(number, 0., 255.));
       }
     }
@@ -134,7 +143,9 @@ void read_faces(const PlyElement& element, const std::string& label, PlyBody& bo
       if (is_corner_list(property)) {
         read_corners(property, body, path + ": face " + std::to_string(i), surface.vertices.size(), corners);
       } else if (property.count_bytes == 0 && property.name == label) {
-        value = static_cast<std::int64_t>(std::clamp(body.number(property.type), -1e9, 1e10));
+        const double number = body.number(property.type);
+        check_number(number, path, "face", i, property);
+        value = static_cast<std::int64_t>(std::clamp(number, -1e9, 1e10));
       } else {
         body.skip(property);
       }

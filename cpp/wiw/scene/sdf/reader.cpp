@@ -190,7 +190,8 @@ bool SdfReader::read_mesh(const pugi::xml_node& mesh, const fs::path& file, Geom
   geometry.mesh = finder_.find(uri, file);
   geometry.submesh = mesh.child("submesh").child_value("name");
   if (mesh.child("scale")) geometry.size = vector_of(mesh.child("scale"), file);
-  if (!geometry.mesh.empty()) return true;
+  std::error_code ignored;
+  if (fs::is_regular_file(geometry.mesh, ignored)) return true;
   warn("mesh '" + uri + "' was not found in " + finder_.searched() + "; left out");
   return false;
 }
