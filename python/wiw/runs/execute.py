@@ -15,7 +15,7 @@ from wiw.runs.progress import ArmProgress, Board, Tracker, make_board
 from wiw.runs.recipes import AgentRecipe, TaskRecipe
 from wiw.runs.rows import AgentRow, DecisionRow, LostRow, RestartRow
 from wiw.runs.scene_map import draw_scene_maps
-from wiw.runs.sources import exists, require_sources
+from wiw.runs.sources import file_exists, require_sources
 from wiw.runs.store import RunStore
 from wiw.runs.workers import Job, Row, WorkerSpec, run_here, run_in_workers
 from wiw.types import Episode, EpisodeResult
@@ -94,7 +94,7 @@ def update_own_sources(store: RunStore, task: Any, agents: Mapping[str, Any]) ->
         return
     ended = {row["arm"] for row in store.recorded_outcomes() if row["status"] == "done"}
     fixed = sources_of(task, {arm: recipe for arm, recipe in agents.items() if arm in ended})
-    kept = {path: digest for path, digest in begun_with.items() if path in fixed or not exists(path)}
+    kept = {path: digest for path, digest in begun_with.items() if path in fixed or not file_exists(path)}
     try:
         require_sources(store.path.parent, kept if ended else None, fixed)
     except StoreError:

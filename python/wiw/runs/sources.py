@@ -82,7 +82,7 @@ def require_unchanged(begun_with: Mapping[str, str]) -> None:
     require_sources(Path("this run"), {path: begun_with[path] for path in files}, now)
 
 
-def exists(path: str) -> bool:
+def file_exists(path: str) -> bool:
     """Return whether the file of a digest is still there."""
     return Path(path.partition(SCRIPT)[0]).is_file()
 

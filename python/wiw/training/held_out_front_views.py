@@ -70,7 +70,7 @@ class FrontViewClips(HeldOutClips[ClipErrors]):
 
     @property
     def view(self) -> FrontView:
-        """What the model sees of a front view."""
+        """The part of a front view that the model sees."""
         return self.seen_by
 
     def observe(self, rows: slice) -> Conditioning:
