@@ -93,7 +93,7 @@ def carry_out(victims: Victims, work: Work, folder: Path, number: int, way: str)
 
 
 WORKS = ("run", "run on a local disk", "resume", "merge", "csv", "parquet", "view", "report", "collect", "train")
-FILES = ("csv", "parquet", "view", "report")
+FILES = ("csv", "parquet", "view", "report", "train")
 """Jobs that write files or folders at once."""
 
 
