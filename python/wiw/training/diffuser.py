@@ -88,11 +88,11 @@ class Recipe:
     """Weight of rotation errors beside position errors."""
     grip: float = 0.1
     """Weight of errors of the gripper's opening."""
-    tilt: float = 0.1
+    tilt: float = 0.5
     """Augmentation: greatest rotation of a scene about the middle of the workspace, in radians."""
     mirror: float = 0.5
     """Augmentation: share of scenes whose left and right are exchanged."""
-    recolor: float = 0.8
+    recolor: float = 1.0
     """Augmentation: share of scenes whose red, green and blue are exchanged at random.
 
     Which colour is meant the policy is not told. Without this it learns by heart what was meant at each table.
