@@ -460,10 +460,9 @@ def _train_diffuser(
             f"{collection.config.get('size')}; collect with --size {Sensors.size}"
         )
     camera = PinholeCamera(collection.camera.intrinsics, collection.camera.T_world_camera)
-    samples = training.extract_samples(
+    own, held_out = training.extract_samples(
         _show_bar(collection, "reading", len(collection)), camera, collection.wrist_intrinsics
-    )
-    own, held_out = samples.hold_out()
+    ).hold_out()
     card: dict[str, Any] = {"demonstrations": collection.config, "moments": len(own), "held out": len(held_out)}
     identity = {**card, "recipe": asdict(recipe), "minutes": minutes}
     checkpoint = Checkpoint(out.with_name(f"{out.name}.checkpoint"), identity)
@@ -474,9 +473,9 @@ def _train_diffuser(
     checkpoint.remove()
     print(f"{len(collection)} demonstrations, {len(own)} samples, {recipe.epochs} epochs")
     if found:
-        near = ", ".join(f"{100 * found[f'near/{count}']:.0f} % within {count}" for count in PATHS)
+        near = ", ".join(f"one of {count} for {100 * found[f'near/{count}']:.0f} %" for count in PATHS)
         print(
-            f"held out  of {len(held_out)} samples a path like the expert's: {near}; the nearest of {max(PATHS)} is "
+            f"held out  a path is the expert's, of {len(held_out)} samples: {near}; the nearest of {max(PATHS)} is "
             f"{1000 * found['off']:.0f} mm off, two paths end {1000 * found['spread']:.0f} mm apart"
         )
 

@@ -73,11 +73,7 @@ def require_own_sources(store: RunStore, task: Any, agents: Mapping[str, Any]) -
     Raises:
         StoreError: a file has changed since.
     """
-    try:
-        require_sources(store.path.parent, store.info.get("sources"), sources_of(task, agents))
-    except StoreError:
-        store.close()
-        raise
+    _require_sources(store, store.info.get("sources"), sources_of(task, agents))
 
 
 def update_own_sources(store: RunStore, task: Any, agents: Mapping[str, Any]) -> None:
@@ -95,12 +91,16 @@ def update_own_sources(store: RunStore, task: Any, agents: Mapping[str, Any]) ->
     ended = {row["arm"] for row in store.recorded_outcomes() if row["status"] == "done"}
     fixed = sources_of(task, {arm: recipe for arm, recipe in agents.items() if arm in ended})
     kept = {path: digest for path, digest in begun_with.items() if path in fixed or not file_exists(path)}
+    _require_sources(store, kept if ended else None, fixed)
+    store.change_sources(now)
+
+
+def _require_sources(store: RunStore, begun_with: Mapping[str, str] | None, now: Mapping[str, str]) -> None:
     try:
-        require_sources(store.path.parent, kept if ended else None, fixed)
+        require_sources(store.path.parent, begun_with, now)
     except StoreError:
         store.close()
         raise
-    store.change_sources(now)
 
 
 def require_left(task: Any, store: RunStore, arms: Iterable[str], retry_errors: bool = False) -> None:

@@ -10,6 +10,7 @@ import torch
 from numpy.typing import NDArray
 from scipy.spatial.distance import pdist
 
+from wiw.policies.diffuser import STEPS
 from wiw.policies.diffuser.diffusion import sample_ddim
 from wiw.policies.diffuser.network import Network, to_tensors
 from wiw.policies.diffuser.paths import SCALE, to_vectors
@@ -19,8 +20,6 @@ NEAR = 0.03
 """Metres by which no pose of a path is off if it counts as the expert's; a button's plate has a radius of 0.034 m."""
 PATHS = (1, 5, 10)
 """Numbers of paths of which one has to be near."""
-STEPS = 20
-"""Denoising steps, as of the policy."""
 BATCH = 16
 """Samples that are encoded together."""
 

@@ -27,6 +27,9 @@ if TYPE_CHECKING:
     from wiw.policies.diffuser.network import Network
 
 
+STEPS = 20
+"""Denoising steps."""
+
 PATH_LENGTH = 50
 """L, poses of a path (paper, appendix "Robotic Manipulation")."""
 
@@ -51,7 +54,7 @@ class Diffuser(Policy):
     needs: tuple[str, ...] = ("depth",)
     default_revision = "scripted"
 
-    def __init__(self, weights: str | Path, steps: int = 20) -> None:
+    def __init__(self, weights: str | Path, steps: int = STEPS) -> None:
         if not 1 <= steps <= 100:
             raise ArgumentError(f"diffuser: expected 1 to 100 steps, got {steps}")
         require_torch()
@@ -63,7 +66,7 @@ class Diffuser(Policy):
         self._digest = blake2b(Path(weights).expanduser().read_bytes(), digest_size=8).hexdigest()
 
     @classmethod
-    def from_network(cls, network: Network, steps: int = 20) -> Diffuser:
+    def from_network(cls, network: Network, steps: int = STEPS) -> Diffuser:
         """Create the policy from a network in memory, such as one in training."""
         policy = cls.__new__(cls)
         policy.steps, policy._network, policy.card, policy._digest = steps, network.eval(), {}, ""
