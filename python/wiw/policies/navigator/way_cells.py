@@ -5,6 +5,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from functools import cached_property
+from math import floor
 
 import numpy as np
 from numpy.typing import NDArray
@@ -55,13 +56,18 @@ class WayCells:
         return bool(((cells >= self.low) & (cells < self.high)).all())
 
     def find(self, points: NDArray[np.float64]) -> NDArray[np.intp]:
-        """Return the cell that each of N points [N, 2] is in, or the nearest one of the map: intp [N]."""
-        rows, columns = self._split(points)
-        return rows * self.shape[1] + columns
+        """Return the cell that each of points [..., 2] is in, or the nearest one of the map: intp [...]."""
+        rows, columns = (self._find_along(axis, points[..., axis]) for axis in (0, 1))
+        rows *= self.shape[1]
+        rows += columns
+        return rows
 
     def find_near(self, point: NDArray[np.float64], radius: float) -> NDArray[np.intp]:
         """Return the cells whose middles are within `radius` metres of a point [2]."""
-        (row,), (column,) = self._split(point[None])
+        row, column = (
+            min(max(floor(at / CELL) - low, 0), count - 1)
+            for at, low, count in zip(point.tolist(), self.low, self.shape, strict=True)
+        )
         reach = int(radius / CELL) + 1
         rows = np.arange(max(0, row - reach), min(self.shape[0], row + reach + 1))
         columns = np.arange(max(0, column - reach), min(self.shape[1], column + reach + 1))
@@ -69,10 +75,11 @@ class WayCells:
         away = self.centres[cells] - point
         return cells[(away**2).sum(axis=1) < radius**2]
 
-    def _split(self, points: NDArray[np.float64]) -> NDArray[np.intp]:
-        """Return row and column of N points, counted from the map's first: intp [2, N]."""
-        cells = np.floor(np.asarray(points) / CELL).astype(np.intp) - self.low
-        return np.clip(cells, 0, np.array(self.shape) - 1).T
+    def _find_along(self, axis: int, metres: NDArray[np.float64]) -> NDArray[np.intp]:
+        """Return the row (axis 0) or column (1) of each coordinate, counted from the map's first, of the same shape."""
+        cells = np.floor(metres / CELL).astype(np.intp)
+        cells -= self.low[axis]
+        return np.clip(cells, 0, self.shape[axis] - 1, out=cells)
 
 
 def _grow_axis(low: int, high: int) -> tuple[int, int]:

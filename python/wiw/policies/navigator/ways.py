@@ -66,10 +66,10 @@ class WayMap:
         away = self.cells.centres - places[:, None]
         straight, azimuths = np.hypot(*np.moveaxis(away, -1, 0)), np.arctan2(away[..., 1], away[..., 0])
         visible = straight < self._measure_sight(places, azimuths) + CELL
-        bend = np.where(visible, own, before)
+        bend = np.where(visible, own, before) + np.arange(len(places))[:, None] * self.cells.count  # of all rows
         for _ in range(8):  # each doubles how far back along its way a cell looks for one in sight
-            bend = np.take_along_axis(bend, bend, axis=1)
-        return Ways(metres * OCTILE, np.take_along_axis(azimuths, bend, axis=1), before, self.cells)
+            bend = bend.take(bend)
+        return Ways(metres * OCTILE, azimuths.take(bend), before, self.cells)
 
     def _measure_sight(self, places: NDArray[np.float64], azimuths: NDArray[np.float64]) -> NDArray[np.float64]:
         """Return how far one could go straight ahead from places [N, 2] at azimuths [N, cells]: float64 [N, cells]."""
@@ -79,7 +79,7 @@ class WayMap:
         free = (self.open | self.unknown).ravel()
         sight = np.empty(azimuths.shape)
         for row, place in enumerate(places):
-            blocked = ~free[self.cells.find((place + points).reshape(-1, 2))].reshape(len(steps), RAYS)
+            blocked = ~free[self.cells.find(place + points)]
             reach = np.where(blocked.any(axis=0), steps[blocked.argmax(axis=0)], np.inf)
             sight[row] = reach[((azimuths[row] + np.pi) / (2 * np.pi) * RAYS).astype(np.intp) % RAYS]
         return sight
