@@ -123,7 +123,7 @@ def train(
     $ wiw run imagenav --world-model warpnet --world-model-option weights=warpnet.safetensors
     $ wiw train perception --out perception.safetensors
     $ wiw train armnet --out armnet.safetensors
-    $ wiw collect manipulation --episodes 120 --frames 16 --depth --wrist --out demos
+    $ wiw collect manipulation --episodes 400 --frames 16 --depth --wrist --out demos
     $ wiw train diffuser --demonstrations demos --out diffuser.safetensors
     $ wiw collect navigation --scenes apartments:train:80 --out data
     $ wiw train pocket --data data --out pocket.safetensors
@@ -139,7 +139,7 @@ def train(
 
     First the training data is prepared from scenes or plays and cached, so that an interrupted command does not
     prepare it again. Training then takes 15 to 30 minutes on two idle cores; perception takes one to two hours,
-    pocket takes two to three hours, diffuser takes a night; less with --minutes, or with --option clips=N for
+    pocket takes two to three hours, diffuser takes an hour or two; less with --minutes, or with --option clips=N for
     pocket. An interrupted training of navigator, perception, pocket, armnet, diffuser or a video model resumes from its
     checkpoint beside FILE; repeat the command. pocket and video models also write it at SIGUSR1.
 

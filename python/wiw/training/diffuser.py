@@ -75,7 +75,7 @@ class Samples:
 class Recipe:
     """Hyper-parameters of the training."""
 
-    epochs: int = 400
+    epochs: int = 40
     batch: int = 8
     """Samples in a batch."""
     levels: int = 8
