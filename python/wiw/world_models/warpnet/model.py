@@ -40,8 +40,8 @@ class WarpNet(Trained):
 
     Args:
         weights: a file of `wiw train warpnet`; None means those that come with wiw.
-        size: (height, width) of panoramas in and out; 576x1024 if not given. With 144x256, all that
-            the matcher reads, a panorama takes a small part of the time. Results differ a little between sizes.
+        size: (height, width) of panoramas in and out; 576x1024 if not given. 144x256, all that the matcher reads, takes
+            a third of the time. Results differ a little between sizes.
 
     Raises:
         ArgumentError: the size is too small.
