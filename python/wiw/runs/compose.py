@@ -8,8 +8,8 @@ from dataclasses import dataclass, replace
 from typing import Any
 
 from wiw.errors import ArgumentError
-from wiw.experiments.errors import make_error
 from wiw.experiments.errors.erroneous import Erroneous
+from wiw.experiments.errors.kinds import make_error
 from wiw.experiments.fidelity import FidelityObserver
 from wiw.experiments.gating import Gated
 from wiw.experiments.ground_truth import TruePlans, TrueScores, sort_stages

@@ -12,7 +12,7 @@ from typing import Any, cast
 from wiw.envs.base import Env
 from wiw.errors import ArgumentError
 from wiw.experiments.counterparts import is_counterpart
-from wiw.experiments.errors import make_error
+from wiw.experiments.errors.kinds import make_error
 from wiw.experiments.errors.erroneous import require_error
 from wiw.experiments.placebos import PLACEBOS, require_words
 from wiw.loop.agent import Agent

@@ -17,8 +17,8 @@ from numpy.typing import NDArray
 from wiw.mapping.landmarks import Landmark
 from wiw.mapping.marks import MarkedViews
 from wiw.mapping.views import VIEW_NAMES
-from wiw.policies.vlm import shorten
 from wiw.policies.vlm.plans import PRIMITIVES
+from wiw.policies.vlm.policy import shorten
 
 if TYPE_CHECKING:
     from pydantic import BaseModel
