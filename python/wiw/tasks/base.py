@@ -62,7 +62,11 @@ class Task(ABC):
 
     @abstractmethod
     def environment(self, depth: bool = False) -> Env:
-        """Return a new environment for the task's episodes; `depth` asks for it in the observations."""
+        """Return a new environment for the task's episodes; `depth` asks for it in the observations.
+
+        A task with `sensor_options` takes these as well. Of them the loop gives `cameras`, ("wrist",), to an agent that
+        needs the view of a wrist camera.
+        """
 
     @abstractmethod
     def episodes(self, count: int) -> list[Episode]:
