@@ -20,12 +20,12 @@ from wiw.loop.agent_spec import AgentSpec, space_option
 from wiw.loop.base import BaseAgent
 from wiw.loop.config import AgentConfig
 from wiw.loop.imagination import Imaginer
-from wiw.loop.limits import Limits
 from wiw.loop.observers import Observer
 from wiw.policies.base import Policy
 from wiw.registry import ISOLATED, POLICIES, SEMANTICS, TRACKERS, WORLD_MODELS
 from wiw.runs.arm_text import EXAMPLE, ArmText, check_arm_name, parse_arm
 from wiw.runs.compose import Experiment, RunContext, compose, make_for_space, require_placebo
+from wiw.runs.limits import Limits
 from wiw.runs.part_options import parse_options
 from wiw.runs.sources import source_digests
 from wiw.tasks.base import Task
