@@ -46,7 +46,7 @@ def run(
     $ wiw run imagenav --world-model warp --episodes 50
     $ wiw run imagenav --arms none,copy,warp,oracle --workers 2 --out runs/first
     $ wiw run imagenav --world-model my_model.py:MyModel --arms none,oracle,heuristic+none
-    $ wiw run imagenav --arms none,big=warpnet?weights=big.npz,small=warpnet?weights=small.npz,oracle
+    $ wiw run imagenav --arms none,big=warpnet?weights=big.safetensors,small=warpnet?weights=small.safetensors,oracle
     $ wiw run imagenav --scenes house.glb --world-model warp
     $ wiw run imagenav --preset foresight --tier all --episodes 180 --arms none,warp,oracle
     $ wiw run imagenav --episode-file val.json.gz --scene-folder scans
@@ -57,7 +57,7 @@ def run(
     $ wiw run imagenav --arms none,warp --episodes 400 --salt 7f3a --shard 3/8 --out runs/a/3 --resume
     $ wiw run imagenav --policy isolated:my_policy.py:MyPolicy --world-model my_model.py:MyModel
 
-    Ctrl-C (exit code 130) or SIGTERM (75, within 5 seconds) stops a run without loss; `wiw resume` continues it.
+    Ctrl-C (exit code 130) or SIGTERM (75, within 6 seconds) stops a run without loss; `wiw resume` continues it.
 
     Args:
         task: See `wiw list`.
