@@ -61,7 +61,7 @@ def test_list_takes_a_kind(what: str, names: list[str], others: list[str], capsy
         (["--policy-option", "turn=left"], "policy matcher: turn: expected a number, got 'left'"),
         (["--width", "2"], "give --depth 2 or more"),
         (["--fidelity-share", "0.5"], "give --fidelity"),
-        (["--served", "warp"], "say how many by --servers"),
+        (["--served", "warp"], "give their number with --servers"),
         (["--cache", "off", "--cache-gb", "3"], "leave one of them out"),
         (["--look-every", "5"], "give --until"),
         (["--policy", "recogniser"], "use it with task ar"),

@@ -467,7 +467,7 @@ def test_training_that_was_stopped_goes_on_to_the_same_end(seen: Samples, tmp_pa
     assert steps == [4, 5, 6]
     for name, value in whole.state_dict().items():
         assert torch.equal(value, on.state_dict()[name])
-    with pytest.raises(ArgumentError, match="other data or options"):
+    with pytest.raises(ArgumentError, match="different data or options"):
         Checkpoint(file, {"a": 2}).load()
     file.write_bytes(file.read_bytes()[:50])
     with pytest.raises(FileError, match="delete it"):
@@ -538,7 +538,7 @@ def test_the_command_says_what_it_needs(tmp_path: Path, capsys: pytest.CaptureFi
     with pytest.raises(SystemExit):
         main(["train", "--help"])
     said = " ".join(capsys.readouterr().out.split())
-    assert "diffuser takes an hour or two" in said
+    assert "and diffuser an hour or two" in said
 
 
 def test_the_command_wants_views_as_it_will_see_them(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:

@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The help of flags that a dataclass declares, one paragraph each.
+"""Build the help of flags that a dataclass declares, one paragraph each.
 
-tyro takes the description of a field from its docstring, and keeps every line break there. It also adds
-"(default: None)" to flags whose description says what holds where they are not given.
+tyro takes the description of a field from its docstring, and keeps every line break there. It also adds "(default:
+None)" to flags whose description already says what the default is.
 """
 
 from __future__ import annotations
@@ -16,7 +16,7 @@ from tyro.constructors import StructConstructorSpec, StructFieldSpec, StructType
 
 
 def read_flags(info: StructTypeInfo) -> StructConstructorSpec | None:
-    """Return how a dataclass of wiw is read from flags, None for other types: a rule for a `ConstructorRegistry`."""
+    """Return how to read a dataclass of wiw from flags, None for other types: a rule for a `ConstructorRegistry`."""
     is_ours = dataclasses.is_dataclass(info.type) and info.type.__module__.split(".")[0] == "wiw"
     if not is_ours or not isinstance(info.default, info.type):
         return None
@@ -49,5 +49,5 @@ def _read_descriptions(kind: type) -> dict[str, str]:
 
 
 def _hide_none(annotation: Any, default: Any) -> Any:
-    """Return the type of a field, marked not to show a default of None."""
+    """Return the type of a field, annotated so that a default of None is not shown."""
     return Annotated[annotation, arg(help_behavior_hint="")] if default is None else annotation

@@ -45,8 +45,8 @@ USES: Mapping[str, tuple[tuple[str, ...], str]] = {
     "minutes": ((*ON_SCENES, *ON_PLAYS, "diffuser"), "has no time limit, but --option clips=N"),
     "data": (ON_DATA, "trains on other data"),
     "weights": ((*VIDEO, "recogniser"), "begins with random weights"),
-    "recipe": (ON_DATA, "reads no recipe"),
-    "option": (ON_DATA, "reads no recipe"),
+    "recipe": (ON_DATA, "has no recipe file"),
+    "option": (ON_DATA, "has no recipe file"),
     "device": (VIDEO, "trains on the CPU"),
     "part": (ON_DATA, "trains on other data"),
     "validation": (ON_DATA, "is evaluated on --val, if at all"),
@@ -57,7 +57,7 @@ USES: Mapping[str, tuple[tuple[str, ...], str]] = {
     "partition": (VIDEO, "trains in one process"),
     "dry-run": (VIDEO, "trains in one process"),
 }
-"""For each option that not all networks use: those that do, and why the others refuse it."""
+"""For each option that only some networks use: those networks, and why the others refuse it."""
 
 
 def train(
@@ -98,21 +98,21 @@ def train(
     """Train a network: recogniser, navigator, warpnet, pocket, perception, armnet, diffuser or a video model
     (NAME-action).
 
-    recogniser: the policy of Active Recognition; it recognises the object in a red box from any number of real and
+    recogniser: the policy for Active Recognition; it recognises the object in a red box from any number of real and
     imagined views. Trained on scenes.
-    navigator: the policy of Image-Goal Navigation that estimates, from a panorama and the goal image, how far the goal
+    navigator: the policy for Image-Goal Navigation that estimates, from a panorama and the goal image, how far the goal
     is and in which direction. Trained on scenes.
-    warpnet: a world model of navigation; it predicts the panorama that is seen from a place nearby. Trained on scenes.
-    pocket: a world model of navigation, too: a small video diffusion model that draws all views of a plan together.
-    Trained on a dataset of `wiw collect navigation`, without pretrained weights.
-    perception: the labeller of question answering; it gives each pixel of a view a category and a state, on or off,
-    open or closed. Colour words are calibrated along with it. Trained on scenes.
-    armnet: a world model of manipulation; it predicts the front view after each gripper pose of a plan. Trained on
-    simulated play at the tables of the manipulation tasks, and on demonstrations if there are any.
-    diffuser: the 3D diffusion policy of manipulation. Trained on demonstrations.
+    warpnet: a world model for navigation; it predicts the panorama seen from a place nearby. Trained on scenes.
+    pocket: another world model for navigation: a small video diffusion model that generates all views of a plan
+    together. Trained on a dataset of `wiw collect navigation`, without pretrained weights.
+    perception: the labeller for question answering; it gives each pixel of a view a category and a state (on or off,
+    open or closed). Colour words are calibrated along with it. Trained on scenes.
+    armnet: a world model for manipulation; it predicts the front view after each gripper pose of a plan. Trained on
+    simulated play at the tables of the manipulation tasks, and on demonstrations if given.
+    diffuser: the 3D diffusion policy for manipulation. Trained on demonstrations.
     svd-action, ltx-action, wan2.1-action, wan2.2-5b-action, wan2.2-a14b-action, cosmos-predict2-action: pretrained
-    video generators, post-trained to follow actions of navigation or poses of a gripper. Trained on a dataset of `wiw
-    collect navigation` or `wiw collect manipulation`, on a GPU; docs/post-training.md explains recipes and needs.
+    video generators, post-trained to follow navigation actions or gripper poses. Trained on a dataset of `wiw collect
+    navigation` or `wiw collect manipulation`, on a GPU; docs/post-training.md explains recipes and requirements.
     nwm-action: Navigation World Models, post-trained on front views of a navigation dataset.
 
     $ wiw train recogniser --out recogniser.safetensors
@@ -137,70 +137,71 @@ def train(
     $ wiw train nwm-action --data data --out runs/nwm
     $ wiw train svd-action --data demos --out runs/svd-arm
 
-    First the training data is prepared from scenes or plays and cached, so that an interrupted command does not
-    prepare it again. Training then takes 15 to 30 minutes on two idle cores; perception takes one to two hours,
-    pocket takes two to three hours, diffuser takes an hour or two; less with --minutes, or with --option clips=N for
-    pocket. An interrupted training of navigator, perception, pocket, armnet, diffuser or a video model resumes from its
-    checkpoint beside FILE; repeat the command. pocket and video models also write it at SIGUSR1.
+    First the training data is prepared from scenes or plays and cached, so that an interrupted command need not prepare
+    it again. Training then takes 15 to 30 minutes on two idle cores; perception takes one to two hours, pocket two to
+    three hours, and diffuser an hour or two; less with --minutes, or with --option clips=N for pocket. To resume an
+    interrupted training of navigator, perception, pocket, armnet, diffuser or a video model from its checkpoint next to
+    FILE, repeat the command. pocket and video models also write the checkpoint on SIGUSR1.
 
-    The file also holds the recipe and the figures on held-out data: for recogniser, accuracy and calibration error on
-    one half of the val scenes, after calibration on the other half; for navigator, how well it tells near pairs of
-    places of the val scenes from far ones and how far its bearings are off, beside the matcher's similarity; for
-    warpnet, PSNR and SSIM on the val scenes, beside copy and warp; for pocket, PSNR on windows of the val scenes,
-    beside what has learnt nothing, and how much of it is lost where it is told another window's places; for
-    perception, accuracy and IoU of categories, accuracy of states and of colour words on the val scenes; for armnet,
-    errors on held-out plays, beside copy and a table where nothing but the arm moves; for diffuser, how often one of
-    ten paths is the expert's, for one in twenty demonstrations that it is not trained on. The weights shipped with wiw
-    were trained by this command with its defaults; those of perception for four epochs of a
-    schedule that was first laid out for six (docs/perception.md), those of navigator for three of four
-    (docs/navigation-tasks.md), those of pocket on 16 800 clips, those of recogniser by an earlier recipe
-    (docs/results.md).
+    The file also holds the recipe and the results on held-out data. For recogniser: accuracy and calibration error on
+    one half of the val scenes, after calibration on the other half. For navigator: how well it separates near pairs of
+    places in the val scenes from far ones, and the error of its bearings, next to the matcher's similarity. For
+    warpnet: PSNR and SSIM on the val scenes, next to copy and warp. For pocket: PSNR on windows of the val scenes, next
+    to baselines without learning, and how much of it is lost when given another window's places. For perception:
+    accuracy and IoU of categories, accuracy of states and of colour words on the val scenes. For armnet: errors on
+    held-out plays, next to copy and to a table where nothing but the arm moves. For diffuser: how often one of ten
+    paths is the expert's, on the one in twenty demonstrations that are held out. The weights shipped with wiw were
+    trained by this command with its defaults, except those of perception (four epochs of a schedule first laid out for
+    six, docs/perception.md), navigator (three epochs of four, docs/navigation-tasks.md), pocket (16 800 clips) and
+    recogniser (an earlier recipe, docs/results.md).
 
     Args:
         what: recogniser, navigator, warpnet, pocket, perception, armnet, diffuser or a video model.
-        out: Weights, a safetensors file of a few MB. Default: WHAT.safetensors. For video models a new folder. Default:
-            WHAT.
+        out: File for the weights, a safetensors file of a few MB. Default: WHAT.safetensors. For video models a new
+            folder. Default: WHAT.
         data: Dataset for pocket and video models: a folder of `wiw collect navigation`; for video models also of `wiw
             collect manipulation`.
-        weights: Pretrained weights that a video model begins with: a folder as save_pretrained writes it, or a name on
-            the Hugging Face hub. Default: those of the world model. For recogniser a file of this command, whose
-            training goes on. Default: none.
-        recipe: YAML file with numbers of the recipe of pocket or a video model, on top of the shipped ones.
-        option: Number of such a recipe, such as rate=2e-5, clips=1600 or batch=8; may be given again. See
+        weights: Pretrained weights that a video model starts from: a folder written by save_pretrained, or a name on
+            the Hugging Face hub. Default: those of the world model. For recogniser a file written by this command, to
+            continue its training. Default: none.
+        recipe: YAML file that overrides values of the built-in recipe, for pocket or a video model.
+        option: Override a value of the recipe, such as rate=2e-5, clips=1600 or batch=8; may be repeated. See
             `wiw.training.post_training.recipe.PostTrainingRecipe` and `wiw.training.pocket.recipe.PocketRecipe`.
-        device: Of torch, for video models. Default: the GPU if there is one.
-        part: Part of the dataset for pocket and video models: train leaves out one in twenty scenes, or demonstrations,
-            for validation. Default: train.
-        validation: Another dataset of the same command, of other scenes or demonstrations, on which pocket or a video
-            model is validated while it trains: PSNR and SSIM after 1, 4, 8 and 14 actions, and the control gap.
-            Default: those that --part train leaves out.
-        decisions: File of `wiw collect decisions`, by which validation of pocket, or of a video model that moves, also
-            measures how well its order of the plans agrees with the true one.
-        tracker: Program that draws loss and validation of pocket or a video model; needs its package.
-            OUT.log/metrics.jsonl has the same in any case.
-        scenes: Training scenes of recogniser, navigator, warpnet and perception: apartments:train[:N], a mesh, a Gazebo
-            world or scans, as in `wiw run`. Default: apartments:train:160; 80 of them for warpnet, 200 for navigator.
-        val: Held-out scenes of recogniser, navigator, warpnet, pocket and perception; none may be trained on.
-            recogniser splits them, or the samples of a single one, into halves for calibration and evaluation. Default:
-            apartments:val:20.
-        categories: What recogniser tells apart. Default: the built-in list of 26 categories.
-        demonstrations: Folder of `wiw collect manipulation`: with depth for diffuser, which learns to see by the wrist
-            camera too if they have its views; additional data for armnet.
-        epochs: How often each sample is used, on average. Default: 25 for recogniser, 6 for warpnet, 1 for pocket, 4
-            for navigator, perception and armnet, 400 for diffuser.
-        minutes: Train fewer epochs if all of them would take longer than this.
+        device: Torch device for video models. Default: the GPU if there is one.
+        part: Part of the dataset to train on, for pocket and video models: train holds out one in twenty scenes, or
+            demonstrations, for validation. Default: train.
+        validation: Another dataset from the same `wiw collect` command, with other scenes or demonstrations, on which
+            to validate pocket or a video model during training: PSNR and SSIM after 1, 4, 8 and 14 actions, and the
+            control gap. Default: what --part train holds out.
+        decisions: File of `wiw collect decisions`, with which the validation of pocket, or of a video model for
+            navigation, also measures how well its ranking of the plans agrees with the true one.
+        tracker: Experiment tracker that plots loss and validation of pocket or a video model; requires its package.
+            OUT.log/metrics.jsonl has the same data in any case.
+        scenes: Training scenes for recogniser, navigator, warpnet and perception: apartments:train[:N], a mesh, a
+            Gazebo world or scans, as in `wiw run`. Default: apartments:train:160; for warpnet 80 of them, for navigator
+            200.
+        val: Held-out scenes for recogniser, navigator, warpnet, pocket and perception; none may be trained on.
+            recogniser splits them, or the samples of a single scene, into halves for calibration and evaluation.
+            Default: apartments:val:20.
+        categories: Categories that recogniser distinguishes. Default: the built-in list of 26.
+        demonstrations: Folder of `wiw collect manipulation`: with depth for diffuser, which also learns to use the
+            wrist camera if they have its views; additional data for armnet.
+        epochs: Number of epochs: how often each sample is used, on average. Default: 25 for recogniser, 6 for warpnet,
+            1 for pocket, 4 for navigator, perception and armnet, 400 for diffuser.
+        minutes: Time limit: train fewer epochs if all of them would take longer.
         places: Places sampled in each scene, for recogniser (default: 8), perception (default: 12) and navigator
             (default: 24, and up to three near each), or walks recorded in each scene, for warpnet (default: 24).
-        plays: Simulated plays of armnet, of eight gripper poses each. Default: 2000.
+        plays: Number of simulated plays for armnet, of eight gripper poses each. Default: 2000.
         seed: Seed of the training data and of the weights.
         workers: Processes that prepare training data from scenes or plays, or with engine ray encode clips. Default: 2,
             for video models 1.
-        cache: Folder of prepared training data; it can be deleted at any time. Default: $WIW_CACHE/looks. Of clips as
-            a video model's frozen networks encode them, for later epochs and other trainings. Default: none.
-        encode_only: Encode the clips of a video model's training into --cache, and train nothing.
-        place: Where the processes of --encode-only are; with engine ray, all machines see --data and --cache.
+        cache: Folder for prepared training data, which can be deleted at any time. Default: $WIW_CACHE/looks. For video
+            models, a folder for clips as encoded by the frozen networks, for later epochs and other trainings. Default:
+            none.
+        encode_only: Only encode a video model's training clips into --cache; train nothing.
+        place: Where the processes of --encode-only run; with engine ray, all machines must see --data and --cache.
         layout: Processes of a video model's training.
-        dry_run: Print the command that runs on each machine, for several GPUs, and train nothing.
+        dry_run: For several GPUs: print the command to run on each machine; train nothing.
     """
     from wiw.scenes.store import folder
 
@@ -272,7 +273,7 @@ def _require_no_encoding(workers: int | None, place: Engine) -> None:
 
 @dataclass(frozen=True)
 class _DataOptions:
-    """Where training data comes from, and how it is prepared."""
+    """The source of training data, and how it is prepared."""
 
     scenes: str
     val: str
@@ -451,7 +452,8 @@ def _train_diffuser(
 
     if demonstrations is None:
         raise ArgumentError(
-            "diffuser trains on demonstrations; give a folder of `wiw collect manipulation --depth` by --demonstrations"
+            "diffuser trains on demonstrations; give a folder of `wiw collect manipulation --depth` with "
+            "--demonstrations"
         )
     collection, recipe = Demonstrations(demonstrations), training.Recipe(**recipe_options)
     if collection.config.get("size") != Sensors.size:
@@ -551,15 +553,15 @@ def _check_use(what: str, given: Mapping[str, Any]) -> None:
 
 
 def _check_out(out: Path) -> None:
-    """Check that the file can be written, before the minutes that training takes."""
+    """Check that the file can be written, before spending minutes on training."""
     from wiw.errors import FileError
 
     if not out.absolute().parent.is_dir() or out.is_dir():
-        raise FileError(f"{out}: cannot be written; choose a file in a folder that exists by --out")
+        raise FileError(f"{out}: cannot be written; choose a file in an existing folder with --out")
 
 
 def _check_scenes(scenes: str, val: str) -> None:
-    """Check that no scene is both trained and evaluated on, whatever its path or the edits of an apartment."""
+    """Check that no scene is used for both training and evaluation, whatever its path or an apartment's edits."""
     from wiw.errors import ArgumentError
     from wiw.scenes import absolute, resolve, strip_edits
 
@@ -580,7 +582,7 @@ def _report_recogniser(card: dict[str, Any], temperature: float) -> None:
             + (f", hard {100 * hard:5.1f} %" if hard is not None else "")
         )
     error = card["calibration_error"]
-    print(f"calibration error {error['before']:.3f}, at temperature {temperature:.2f} {error['after']:.3f}")
+    print(f"calibration error {error['before']:.3f}, {error['after']:.3f} at temperature {temperature:.2f}")
 
 
 def _report_warpnet(card: dict[str, Any]) -> None:

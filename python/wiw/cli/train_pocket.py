@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""`wiw train pocket`: a small video generator, from nothing."""
+"""`wiw train pocket`: train a small video generator from scratch."""
 
 from __future__ import annotations
 
@@ -24,21 +24,21 @@ def train_pocket(
     given: Mapping[str, Any],
     bar: Callable[..., Any],
 ) -> None:
-    """Train pocket, measure it on held-out scenes and print what was found.
+    """Train pocket, evaluate it on held-out scenes and print the results.
 
     Args:
         out: file of the weights.
         data: folder of the dataset.
         cache: folder of prepared training data.
-        val: scenes that it is measured on.
+        val: scenes to evaluate it on.
         recipe: YAML file on top of the shipped recipe.
-        pairs: KEY=VALUE of the recipe, on top of both.
-        numbers: of the recipe that have flags of their own.
-        given: part of the dataset, and what it is validated on.
+        pairs: KEY=VALUE overrides of both.
+        numbers: values of the recipe that have their own flags.
+        given: the part of the dataset to train on, and the validation data.
         bar: wraps an iterable in a progress bar.
 
     Raises:
-        ArgumentError: no data, scenes that are not there, or scenes to measure it on that it is trained on; see also
+        ArgumentError: no data, scenes that do not exist, or scenes used for both training and evaluation; see also
             `wiw.training.pocket.train.train_pocket`.
     """
     from wiw.datasets.navigation import NavigationData
@@ -66,7 +66,7 @@ def train_pocket(
 
 
 def _check_held_out(val: str, data: NavigationData) -> None:
-    """Check that scenes are there and are not trained on; a dataset knows its scenes by name alone."""
+    """Check that scenes exist and are not trained on; a dataset identifies its scenes only by name."""
     from wiw.datasets.scene_splits import name_scene
     from wiw.errors import ArgumentError
     from wiw.scenes import resolve, strip_edits
@@ -75,8 +75,8 @@ def _check_held_out(val: str, data: NavigationData) -> None:
     shared = next((spec for spec in resolve(val) if strip_edits(name_scene(spec)) in trained), None)
     if shared is not None:
         raise ArgumentError(
-            f"--val: expected held-out scenes that are not trained on, got {shared}, and {data.folder} has a scene of "
-            "that name; choose others"
+            f"--val: expected held-out scenes, got {shared}, but {data.folder} has a scene of that name to train on; "
+            "choose others"
         )
 
 
@@ -88,4 +88,4 @@ def _report(card: Mapping[str, Any]) -> None:
             print(f"  {name:<28}" + "".join(f"{values[step]:8.1f}" for step in values))
         if found["gap"]:
             print(f"  {'control gap':<28}" + "".join(f"{value:8.1f}" for value in found["gap"].values()))
-    print("PSNR in dB of whole panoramas, weighted by latitude; the gap is what is lost when others' places are shown")
+    print("PSNR in dB of whole panoramas, weighted by latitude; the gap is the loss when given another window's places")

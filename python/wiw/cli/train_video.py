@@ -30,11 +30,11 @@ VideoName = Literal[
 ]
 TrackerName = Literal["trackio", "wandb", "tensorboard"]
 VIDEO: tuple[str, ...] = get_args(VideoName)
-"""Pretrained models that are trained to follow actions."""
+"""Pretrained models that can be post-trained to follow actions."""
 RUN_AS: Mapping[str, str] = {"nwm-action": "nwm"}
-"""World models that have another name than they are trained by."""
+"""World models whose name differs from the name they are trained under."""
 LINE_SECONDS = 60.0
-"""Time between two lines of progress where the output is no terminal."""
+"""Seconds between progress lines if the output is not a terminal."""
 
 
 def train_video(
@@ -48,25 +48,24 @@ def train_video(
     layout: ProcessLayout,
     dry_run: bool,
 ) -> int:
-    """Post-train a model and print where its checkpoint is, or start several processes that do.
+    """Post-train a model and print where its checkpoint is, or start several processes that do so.
 
     Args:
         name: of the model.
         out: folder of the checkpoint.
         data: folder of the dataset.
         recipe: YAML file on top of the shipped recipe.
-        pairs: KEY=VALUE of the recipe, on top of both.
-        numbers: of the recipe that have flags of their own.
-        weights: which pretrained weights, on which device; part of the data; what it is validated on; folder of encoded
-            clips.
-        layout: how many processes, where.
-        dry_run: whether to print torchrun's command and to train nothing.
+        pairs: KEY=VALUE overrides of both.
+        numbers: values of the recipe that have their own flags.
+        weights: pretrained weights and device; part of the data; validation data; folder of encoded clips.
+        layout: how many processes run, and where.
+        dry_run: whether to print torchrun's command and train nothing.
 
     Returns:
-        The exit code: of the process that failed first if there are several.
+        The exit code; if there are several processes, that of the first one that failed.
 
     Raises:
-        ArgumentError: no data, or a recipe whose steps the processes cannot share out; see also
+        ArgumentError: no data, or a recipe whose steps cannot be split among the processes; see also
             `wiw.training.post_training.train.post_train`.
         DependencyError, InfrastructureError: see `wiw.training.launcher.submit_job`.
     """
@@ -118,7 +117,7 @@ def encode_video(
 
     folder = require_data(name, data, " or `wiw collect manipulation`")
     if cache is None:
-        raise ArgumentError("train: --encode-only writes encoded clips into a folder: name it with --cache")
+        raise ArgumentError("train: --encode-only writes encoded clips into a folder; name it with --cache")
     chosen, began = _choose_recipe(name, recipe, pairs, numbers, weights), time.monotonic()
     with announce_resume(), Bars() as bars:
 
@@ -162,7 +161,7 @@ def _choose_recipe(
 
 
 def describe_steps(card: Mapping[str, Any], batch: int) -> str:
-    """Return how long a training was, how it ended, and which weights were the best."""
+    """Describe a training: its length, how it ended, and which weights were best."""
     text = f"{card['trained_steps']:,} steps of {batch} clips, loss {card['loss']:.4f}"
     if "validation" not in card:
         return text
@@ -184,12 +183,12 @@ def require_data(name: str, data: Path | None, also: str = "") -> Path:
         ArgumentError: there is none.
     """
     if data is None:
-        raise ArgumentError(f"{name} trains on a dataset; give a folder of `wiw collect navigation`{also} by --data")
+        raise ArgumentError(f"{name} trains on a dataset; give a folder of `wiw collect navigation`{also} with --data")
     return data
 
 
 class TrainingProgress:
-    """Steps, loss, clips per second and memory: a bar with the time left, or a line a minute."""
+    """Steps, loss, clips per second and memory: a progress bar with the time left, or one line per minute."""
 
     def __init__(self, batch: int) -> None:
         self._batch, self._bars = batch, Bars()
@@ -204,7 +203,7 @@ class TrainingProgress:
         self._bars.__exit__()
 
     def show_validation(self, step: int, found: Mapping[str, float]) -> None:
-        """Print what a validation found."""
+        """Print the results of a validation."""
         print(f"validation: step {step:,}, {describe_validation(found)}", file=sys.stderr, flush=True)
 
     def __call__(self, step: int, steps: int, loss: float) -> None:
@@ -231,11 +230,11 @@ def describe_validation(found: Mapping[str, float]) -> str:
         texts.append(f"gap of displacements {found['gap/displacements']:.2f} dB")
     if "rank" in found:
         texts.append(f"rank agreement {found['rank']:.2f}")
-    return ", ".join(texts) or "no clip leads anywhere"
+    return ", ".join(texts) or "no clip moves the camera"
 
 
 def _describe_memory() -> str:
-    """Return the most memory used so far, of the GPU if there is one."""
+    """Describe the peak memory so far, of the GPU if there is one."""
     import resource
 
     import torch
