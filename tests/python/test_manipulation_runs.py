@@ -69,7 +69,7 @@ def test_imagination_is_measured_against_a_fork(run: Path) -> None:
 
 def test_a_run_is_verified_compared_and_exported(run: Path, tmp_path: Path, capsys: Any) -> None:
     assert main(["verify", str(run), "--episodes", "2"]) == 0
-    assert "all as recorded" in capsys.readouterr().out
+    assert "everything is as recorded" in capsys.readouterr().out
     assert main(["compare", str(run), str(run)]) == 0
     assert main(["export", str(run), "--csv", str(tmp_path / "tables")]) == 0
 

@@ -305,7 +305,7 @@ def test_servers_without_a_model_or_with_several_are_refused(tmp_path):
     other = {**agents, "d": AgentRecipe("matcher", "warp", model_options={"steps": 3})}
     with pytest.raises(ArgumentError, match="different options"):
         find_served(other, "warp")
-    with pytest.raises(ArgumentError, match="servers are actors of Ray"):
+    with pytest.raises(ArgumentError, match="servers are Ray actors"):
         evaluate(TaskRecipe(TASK), AgentRecipe("heuristic", "warp"), 1, out=tmp_path / "run", servers=1)
     with pytest.raises(ArgumentError, match="give --engine ray"):
         RunConfig(vlm_servers=1)

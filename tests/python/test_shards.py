@@ -120,7 +120,7 @@ def test_the_command_line_runs_merges_and_compares(tmp_path, capsys):
 
     run("--out", tmp_path / "whole", "--no-report")
     shown = [run("--out", tmp_path / "parts" / str(i), "--shard", f"{i}/2", "--resume") for i in (1, 2)]
-    assert all("shard   " in each.err and "merge all of them with `wiw merge`" in each.out for each in shown)
+    assert all("shard   " in each.err and "merge all shards with `wiw merge`" in each.out for each in shown)
     assert not list((tmp_path / "parts").rglob("report.html"))
     assert main(["merge", str(tmp_path / "parts"), "--out", str(tmp_path / "merged")]) == 0
     assert "5 episodes of 2 stores" in capsys.readouterr().out
@@ -158,7 +158,7 @@ def test_stores_of_unlike_runs_are_refused_and_the_difference_is_named(tmp_path,
         edit(tmp_path / "2", "UPDATE run SET config = replace(config, 'heuristic', 'matcher')")
     else:
         begin(tmp_path / "2", shard="2/2", **changed).close()
-    with pytest.raises(StoreError, match=f"not of the same run: {named}"):
+    with pytest.raises(StoreError, match=f"not from the same run: {named}"):
         wiw.merge([tmp_path / "1", tmp_path / "2"], tmp_path / "merged")
     assert not (tmp_path / "merged").exists()
 

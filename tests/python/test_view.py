@@ -126,7 +126,7 @@ def test_a_picture_that_cannot_be_made_is_told(tmp_path):
         album.finish()
         assert (tmp_path / "images/b.webp").read_bytes() == b"b" and (album.count, album.size) == (2, 2)
         album.draw("c", lambda: decode_jpeg(b"no picture"))
-        with pytest.raises(StoreError, match="no JPEG"):
+        with pytest.raises(StoreError, match="not a JPEG"):
             album.finish()
 
 

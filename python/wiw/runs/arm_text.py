@@ -56,11 +56,11 @@ def check_arm_name(name: str, text: str | None = None) -> None:
     """
     place = f" in '{text}'" if text is not None else ""
     if not name or name != name.strip():
-        raise ArgumentError(f"arms: expected a name without spaces around it, got '{name}'{place}; as in {EXAMPLE}")
+        raise ArgumentError(f"arms: expected a name without surrounding spaces, got '{name}'{place}; as in {EXAMPLE}")
     if found := FORBIDDEN.search(name):
         raise ArgumentError(
-            f"arms: the name '{name}'{place} has the character {found.group()!r}; use letters, digits, '-', '_' and "
-            f"'.', as in {EXAMPLE}"
+            f"arms: the name '{name}'{place} contains {found.group()!r}; use letters, digits, '-', '_' and '.', as in "
+            f"{EXAMPLE}"
         )
 
 
@@ -73,7 +73,7 @@ def split_arms(text: str) -> list[str]:
     """
     arms = [arm.strip() for arm in re.split(r",(?!\s*wss?://)(?![^\[]*\])", text) if arm.strip()]
     if not arms:
-        raise ArgumentError(f"arms: expected one or several, as in none,copy,warp or {EXAMPLE}, got '{text}'")
+        raise ArgumentError(f"arms: expected at least one, as in none,copy,warp or {EXAMPLE}, got '{text}'")
     return arms
 
 

@@ -26,7 +26,8 @@ def require_same(path: Path, stored: dict[str, Any], wanted: dict[str, Any]) -> 
         return
     detail = "; ".join(_list_differences(stored, wanted))
     raise StoreError(
-        f"{path} is a run of another configuration ({detail}); resume it as it was begun or give another folder"
+        f"{path} holds a run with a different configuration ({detail}); resume it with its own configuration, or give "
+        "another folder"
     )
 
 

@@ -52,9 +52,9 @@ def read_recipes(store: RunStore) -> tuple[TaskRecipe, dict[str, AgentRecipe]]:
     info = store.info
     if info["task"] is None or None in info["agents"].values():
         raise StoreError(
-            f"{store.path} was begun with objects in memory, which cannot be made again from here; "
-            "call the same wiw.evaluate(..., out=..., resume=True) again, or begin runs with names: "
-            "wiw.runs.recipes.AgentRecipe, or `wiw run`"
+            f"{store.path} was started with objects in memory, which cannot be rebuilt here; call the same "
+            "wiw.evaluate(..., out=..., resume=True) again. Runs started by name (wiw.runs.recipes.AgentRecipe, or "
+            "`wiw run`) can be resumed from anywhere"
         )
     return TaskRecipe(**info["task"]), {arm: AgentRecipe.from_json(recipe) for arm, recipe in info["agents"].items()}
 
@@ -298,6 +298,6 @@ class _StoreWriter:
         if len(errors) == SAME_ERRORS and len({error.partition(":")[0] for error in errors}) == 1:
             raise InfrastructureError(
                 f"the first {SAME_ERRORS} episodes of arm '{arm}' all ended with the same error, so the run was "
-                f"stopped: {errors[0]}. Fix the cause, then `wiw resume --retry-errors`; the run "
-                "store has the tracebacks"
+                f"stopped: {errors[0]}. Fix the cause, then `wiw resume --retry-errors`; the tracebacks are in the run "
+                "store"
             )

@@ -110,9 +110,9 @@ def find_judge(judges: Sequence[JudgeRecord], name: str | None, place: str) -> J
         return found[0]
     listed = "; ".join(judge.full_label + (" (the run's own)" if judge.own else "") for judge in judges)
     if found:
-        raise ArgumentError(f"judge '{name}': {len(found)} judges of {place} go by that; name a digest: {listed}")
+        raise ArgumentError(f"judge '{name}': {len(found)} judges of {place} match this name; give a digest: {listed}")
     raise ArgumentError(
-        f"judge '{name}': {place} has no marks by it. It has those by: {listed}. `wiw judge {place}` adds some"
+        f"judge '{name}': {place} has no marks by it, only by: {listed}. `wiw judge {place}` adds marks"
     )
 
 
@@ -138,7 +138,7 @@ def _apply_judge(row: dict[str, Any], judged: Mapping[str, Any] | None, judge: J
         return {**row, **judged}
     if judge.own:
         return row
-    said = f"not judged yet by {judge.full_label}; `wiw judge RUN` with that judge asks for what is missing"
+    said = f"not judged yet by {judge.full_label}; `wiw judge RUN` with that judge requests the missing marks"
     return {**row, "status": "error", "metrics": {}, "details": {}, "error": said, "kind": NOT_JUDGED}
 
 

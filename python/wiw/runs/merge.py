@@ -54,17 +54,17 @@ class Merged:
         return not self.pending
 
     def __str__(self) -> str:
-        lines = [f"{self.run}: {self.ended} episodes of {self.stores} stores"]
+        lines = [f"{self.run}: {self.ended} episodes from {self.stores} stores"]
         if self.repeated:
             lines.append(f"{self.repeated} of them were in several stores, with equal records")
         if self.unlike:
-            lines.append(f"{len(self.unlike)} were in several stores with unlike records; the first was taken:")
+            lines.append(f"{len(self.unlike)} were in several stores with different records; the first was taken:")
             lines += [f"  {text}" for text in self.unlike]
         if self.pending:
             left = ", ".join(f"{arm} {count}" for arm, count in self.pending.items())
             lines.append(f"episodes that no store has: {left}; run them with `wiw resume {self.run}`")
         if self.undrawn:
-            lines.append(f"scene maps and films could not be drawn here: {self.undrawn}")
+            lines.append(f"scene maps and films could not be rendered here: {self.undrawn}")
         return "\n".join(lines)
 
 
@@ -121,8 +121,8 @@ def require_equal_manifests(stores: Sequence[RunStore]) -> None:
     for other in stores[1:]:
         for place, here, there in _compare(manifest, _read_manifest(other), ""):
             raise StoreError(
-                f"{first.path.parent} and {other.path.parent} are not of the same run: {place}: "
-                f"{_show(here)} and {_show(there)}; expected stores of one command that differ in --shard alone"
+                f"{first.path.parent} and {other.path.parent} are not from the same run: {place}: {_show(here)} and "
+                f"{_show(there)}; expected stores of one command that differ only in --shard"
             )
     known: dict[str, tuple[Path, Any]] = {}  # by arm: a store has built the agents of those that it has begun
     for store in stores:
@@ -130,7 +130,7 @@ def require_equal_manifests(stores: Sequence[RunStore]) -> None:
             folder, own = known.setdefault(arm, (store.path.parent, agent))
             for place, here, there in _compare(own, agent, f"agent {arm}"):
                 raise StoreError(
-                    f"{folder} and {store.path.parent} had unlike agents: {place}: {_show(here)} and "
+                    f"{folder} and {store.path.parent} had different agents: {place}: {_show(here)} and "
                     f"{_show(there)}; expected the same weights and options everywhere"
                 )
 
@@ -191,9 +191,9 @@ def _find_difference(
     text = next(list_differences(facts, facts_there), "")
     if text and _is_promised(store, row["arm"], facts) and store.info["platform"] == store_there.info["platform"]:
         raise StoreError(
-            f"{row['arm']} episode {row['episode']} has unlike records in {store.path.parent} and "
-            f"{store_there.path.parent}, though equal ones are promised of its parts on equal machines: {text}. "
-            "Find out which is right with `wiw verify`, and merge without the other"
+            f"{row['arm']} episode {row['episode']} has different records in {store.path.parent} and "
+            f"{store_there.path.parent}, although its parts guarantee equal ones on equal machines: {text}. Find out "
+            "which is right with `wiw verify`, and merge without the other"
         )
     return f"{row['arm']} episode {row['episode']}: {text}" if text else ""
 

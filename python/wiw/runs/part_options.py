@@ -46,7 +46,7 @@ def parse_options(pairs: Sequence[str], factory: Callable[..., Any], flag: str) 
         try:
             options[name] = path or (value if annotation.startswith("str") else yaml.safe_load(value))
         except yaml.YAMLError as error:
-            raise ArgumentError(f"{flag}: {pair}: the value is no YAML ({error})") from None
+            raise ArgumentError(f"{flag}: {pair}: the value is not valid YAML ({error})") from None
     return options
 
 

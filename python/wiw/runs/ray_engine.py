@@ -223,7 +223,7 @@ class _ActorPool:
             self._replace(lease, error)
             return
         except self._ray.exceptions.RayTaskError as error:
-            raise InfrastructureError(f"an actor of Ray failed: {error}") from error
+            raise InfrastructureError(f"a Ray actor failed: {error}") from error
         for row in rows:
             self._receive_row(lease, lease.job, row)
 
@@ -294,5 +294,5 @@ class _ActorPool:
         self._leases.remove(lease)
         cause = str(error).strip().splitlines()[0]
         if lease.job is None:
-            raise InfrastructureError(f"an actor of Ray could not start: {error}") from error
+            raise InfrastructureError(f"a Ray actor could not start: {error}") from error
         self._jobs.extend(lease_again(lease.job, lease.unfinished, self._receiver, TRIES, cause))

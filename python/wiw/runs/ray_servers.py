@@ -75,7 +75,7 @@ class ServerActor:
     def wait(self) -> str:
         """Return why the server has ended, once it has."""
         assert self._process is not None
-        return f"exit code {self._process.wait()}; its latest output: {self._read_output() or 'none'}"
+        return f"exit code {self._process.wait()}; its last output: {self._read_output() or 'none'}"
 
     def _await_announcement(self, file: Path) -> ServerAddress:
         assert self._process is not None
@@ -85,7 +85,7 @@ class ServerActor:
                 raise InfrastructureError(self.wait())
             if time.monotonic() > give_up:
                 self._process.kill()
-                raise InfrastructureError(f"it did not serve within {START_SECONDS:g} s; {self.wait()}")
+                raise InfrastructureError(f"it did not start serving within {START_SECONDS:g} s; {self.wait()}")
             time.sleep(GLANCE)
         return found[0]
 
@@ -211,8 +211,8 @@ class ServerPool:
         if not self._servers:
             command = shlex.join(["wiw", *server.command.arguments])
             raise LostServersError(
-                f"the last server was lost {TRIES} times while no episode ended: {command}: {cause}. Mend "
-                "it, then `wiw resume`, with --retry-errors for the episodes that were asking it"
+                f"the last server was lost {TRIES} times without any episode finishing: {command}: {cause}. Fix it, "
+                "then `wiw resume`, with --retry-errors for the episodes that were using it"
             )
 
 

@@ -113,8 +113,8 @@ def make_local_folder(parent: str | Path | None) -> Iterator[Path]:
         folder = tempfile.TemporaryDirectory(prefix="wiw-", dir=own)
     except OSError as error:
         raise FileError(
-            f"{own}: no folder can be made there ({error.strerror}); expected a local disk with free space and the "
-            "right to write: make room or name another with --scratch (scratch=)"
+            f"{own}: cannot create a folder there ({error.strerror}); expected a writable local disk with free space: "
+            "make room, or choose another with --scratch (scratch=)"
         ) from error
     with folder as path:
         yield Path(path)

@@ -107,8 +107,8 @@ class RunStore:
         path = store_path(run) if copy is None else copy.path
         if cls.exists(run):
             raise StoreError(
-                f"{store_path(run)} holds a run already; continue it with `wiw resume {store_path(run).parent}` "
-                "(or evaluate(..., resume=True)), or give another output folder"
+                f"{store_path(run)} already holds a run; continue it with `wiw resume {store_path(run).parent}` (or "
+                "evaluate(..., resume=True)), or give another output folder"
             )
         make_folder(store_path(run))
         lock = lock_store(path) if copy is None else lock_both(copy)
@@ -193,8 +193,8 @@ class RunStore:
         """
         if self.wiw_version != wiw.__version__:
             raise StoreError(
-                f"{self.path} was begun by wiw {self.wiw_version}, this is {wiw.__version__}: results of two versions "
-                "must not be mixed; install that version or start a new run"
+                f"{self.path} was started by wiw {self.wiw_version}, this is {wiw.__version__}: results of two "
+                "versions must not be mixed; install that version or start a new run"
             )
         self.require_benchmark()
 
@@ -206,9 +206,9 @@ class RunStore:
         """
         if self.benchmark != benchmark.VERSION:
             raise StoreError(
-                f"{self.path} is of version {self.benchmark} of the benchmark, and this wiw runs version "
-                f"{benchmark.VERSION}, in which decisions differ (docs/results.md); use the wiw that began the run, or "
-                "start a new one. Its records can still be read, reported and exported"
+                f"{self.path} uses version {self.benchmark} of the benchmark, but this wiw runs version "
+                f"{benchmark.VERSION}, in which decisions differ (docs/results.md); use the wiw that started the run, "
+                "or start a new one. Its records can still be read, reported and exported"
             )
 
     def require_task(self, task: dict[str, Any]) -> None:
@@ -272,14 +272,14 @@ class RunStore:
         """Check the file's length: SQLite reads a last page that is cut short as zeros."""
         pages, size = (self._rows(f"PRAGMA {name}")[0][name] for name in ("page_count", "page_size"))
         if not has_log(self.path) and self.path.stat().st_size < pages * size:  # in this order: a log may just go
-            raise StoreError(f"{self.path}: the file is cut short; {find_remedy(self.path, 'malformed')}")
+            raise StoreError(f"{self.path}: the file is truncated; {find_remedy(self.path, 'malformed')}")
 
     def _require_readable(self) -> None:
         application, version = (self._rows(f"PRAGMA {name}")[0][name] for name in ("application_id", "user_version"))
         if application != APPLICATION_ID:
             raise StoreError(
-                f"{self.path} is no run store of wiw: expected application id {APPLICATION_ID:#x}, got "
-                f"{application:#x}. If its creation was cut off, begin the run again; else name another folder"
+                f"{self.path} is not a run store of wiw: expected application id {APPLICATION_ID:#x}, got "
+                f"{application:#x}. If its creation was interrupted, start the run again; otherwise give another folder"
             )
         if not OLDEST_READABLE <= version <= SCHEMA_VERSION:
             raise StoreError(
@@ -823,7 +823,7 @@ def leave_resumable(begun: RunStore) -> Iterator[None]:
             if counted["n"] == 0:
                 remove_store(path)
             elif store.info["task"] is not None:  # else it was begun with objects, and no command can resume it
-                note = f"What was recorded is kept. Once the cause is mended:  wiw resume {path.parent}"
+                note = f"Everything recorded is kept. Once the cause is fixed:  wiw resume {path.parent}"
                 vars(error).setdefault("__notes__", []).append(note)  # as `add_note` of Python 3.11 does
         raise
 

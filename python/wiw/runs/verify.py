@@ -63,7 +63,9 @@ class Verification:
             for check in self.checks
         ]
         wrong = sum(not check.same for check in self.checks)
-        verdict = "all as recorded" if not wrong else f"{wrong} of {len(self.checks)} differ from what was recorded"
+        verdict = (
+            "everything is as recorded" if not wrong else f"{wrong} of {len(self.checks)} differ from what was recorded"
+        )
         return "\n".join([*lines, f"{self.run}: {verdict}"])
 
 
@@ -91,7 +93,7 @@ def verify(run: str | Path, episodes: int = 3, seed: int = 0) -> Verification:
         store.require_benchmark()
         ended = {(row["arm"], row["episode"]): row for row in store.recorded_outcomes() if row["status"] == "done"}
         if not ended:
-            raise StoreError(f"{store.path} has no ended episode that could be run again; see `wiw resume`")
+            raise StoreError(f"{store.path} has no finished episode to rerun; see `wiw resume`")
         known = sorted({index for _, index in ended})
         chosen = sorted(random.Random(seed).sample(known, min(episodes, len(known))))
         again = _run_again(store, {key for key in ended if key[1] in chosen})
