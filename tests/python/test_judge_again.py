@@ -159,7 +159,7 @@ def test_a_server_that_stays_dead_is_not_asked_about_every_answer(tmp_path: Path
     with VlmServer(MockClient(model="m")) as server:
         spec = f"rules+llm:{server.url}#m"
     found = wiw.judge(run, spec, progress=False, cache="off", attempts=1, concurrency=2)
-    assert len(found.missing) == count and found.asked < 10 and "answers were not asked about" in found.stopped
+    assert len(found.missing) == count and found.asked < 10 and "answers were not judged" in found.stopped
 
 
 def test_a_model_without_a_name_at_a_dead_server_leaves_the_run_as_it_is(run: Path) -> None:
@@ -232,7 +232,7 @@ def test_judges_go_by_name_and_digest(run: Path) -> None:
     assert low.judge.digest != high.judge.digest
     assert load_run(run, judge=high.judge.digest[:6]).numbers()["warp"].estimates["answer_score"].value == 100
     assert load_run(run, judge="own").numbers()["warp"].estimates["answer_score"].value < 100
-    with pytest.raises(ArgumentError, match=f"2 judges .* name a digest: .*{low.judge.digest}.*{high.judge.digest}"):
+    with pytest.raises(ArgumentError, match=f"2 judges .* give a digest: .*{low.judge.digest}.*{high.judge.digest}"):
         load_run(run, judge="grumpy")
     with pytest.raises(
         ArgumentError, match=r"no marks by it. It has those by: rules\+approximate, \w{12} \(the run's own"
@@ -316,8 +316,8 @@ def test_the_command(run: Path, capsys: pytest.CaptureFixture[str], tmp_path: Pa
     ("flags", "expected"),
     [
         (["--judge", "rules", "--llm", "http://localhost:1/v1"], "--llm is short for --judge rules"),
-        (["--model", "m"], "expected a language model without a name"),
-        (["--judge", "llm:http://localhost:1/v1#m", "--model", "m"], "expected a language model without a name"),
+        (["--model", "m"], "expected a language model given without a name"),
+        (["--judge", "llm:http://localhost:1/v1#m", "--model", "m"], "expected a language model given without a name"),
         (["--judge", "coin"], "judge 'coin': expected rules"),
         (["--judge-option", "temperature=1"], "options temperature are of language models only"),
     ],

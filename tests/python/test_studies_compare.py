@@ -72,7 +72,7 @@ def test_arms_of_two_names(runs):
     assert found.utility("mine · new").value == load_run(runs[1]).numbers().utility("mine").value
     with pytest.raises(ArgumentError, match=r"no arm 'mine' in .*old; it has copy, oracle, warp"):
         wiw.compare(*runs, arm="mine")
-    with pytest.raises(ArgumentError, match="arm= must name one of the first"):
+    with pytest.raises(ArgumentError, match="also name one of the first with arm="):
         wiw.compare(*runs, other="mine")
 
 

@@ -52,7 +52,7 @@ def test_a_study_runs_resumes_and_draws_its_page(own: Path, tmp_path: Path, caps
     command = ["study", str(own), "--out", str(out), "--set", "episodes=2"]
     assert main(command) == 0
     said = capsys.readouterr().out
-    assert "Compared, paired by episode" in said and str(out / "study.html") in said
+    assert "Comparisons, paired by episode" in said and str(out / "study.html") in said
     written = {path.name for path in out.iterdir()}
     assert written >= {"study.html", "study.json", "study.yaml", "here", "here-success-by-arm.svg"}
     page = (out / "study.html").read_text()
@@ -157,7 +157,7 @@ def test_studies_are_listed_taught_and_looked_up(capsys: Any, tmp_path: Path) ->
     with pytest.raises(SystemExit):
         main(["study"])
     taught = capsys.readouterr().out
-    example = taught[taught.index("  title:") : taught.index("Arms take")]
+    example = taught[taught.index("  title:") : taught.index("An arm accepts")]
     (tmp_path / "example.yaml").write_text(example)
     assert [*load_study(tmp_path / "example.yaml").runs[0].agents] == [
         "none",

@@ -54,7 +54,7 @@ def find_pilot(task: str) -> Pilot:
     """
     if task not in PILOTS:
         raise ArgumentError(
-            f"power: no pilot of task '{task}'; there are {', '.join(PILOTS)}, or give a run of your own"
+            f"power: no pilot for task '{task}'; choose from {', '.join(PILOTS)}, or give your own run with --pilot"
         )
     return PILOTS[task]
 

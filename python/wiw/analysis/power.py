@@ -115,7 +115,8 @@ def power(
     """
     if (difference is None) == (scenes is None):
         raise ArgumentError(
-            "power: expected either a difference, for the scenes it needs, or scenes, for what they show"
+            "power: expected either a difference (to compute the scenes it needs) or a number of scenes (to compute "
+            "what they can show)"
         )
     plan = _Plan(losses, correlation, per_scene, chance, 1 - 0.05 / arms if arms > 0 else 0.0, seed)
     if difference is not None:
@@ -160,8 +161,8 @@ class _Plan:
         least, end = 1, int(10 * most + 1e-9)
         if end < least or shown(end)[0] < self.chance:
             raise ArgumentError(
-                f"power: {scenes * self.per_scene} episodes in {scenes} scenes show no difference up to {most:g} "
-                f"points with a chance of {100 * self.chance:g} %; take more scenes"
+                f"power: {scenes * self.per_scene} episodes in {scenes} scenes cannot show a difference of up to "
+                f"{most:g} points with a chance of {100 * self.chance:g} %; take more scenes"
             )
         while least < end:
             middle = (least + end) // 2
@@ -227,8 +228,8 @@ def _check(
         (difference != 0, f"a difference other than 0, got {difference:g}"),
         (0 <= base <= 100, f"base from 0 to 100 %, got {base:g}"),
         (losses >= 0, f"losses of at least 0 %, got {losses:g}"),
-        (only_base <= base, f"no more than the base's {base:g} % of episodes lost, got {only_base:g} %"),
-        (only_arm <= 100 - base, f"no more than the {100 - base:g} % that the base fails in won, got {only_arm:g} %"),
+        (only_base <= base, f"at most the base's {base:g} % of episodes lost, got {only_base:g} %"),
+        (only_arm <= 100 - base, f"at most the {100 - base:g} % in which the base fails won, got {only_arm:g} %"),
         (0 <= correlation < 1, f"correlation in [0, 1), got {correlation:g}"),
         (per_scene >= 1, f"per_scene of at least 1, got {per_scene}"),
         (0 < chance < 1, f"chance between 0 and 1, got {chance:g}"),

@@ -142,7 +142,7 @@ def parse_stop_rule(text: str, arms: Sequence[str], every: int) -> StopRule:
     if match := re.fullmatch(r"(.+?) excludes 0", compact):
         target = _read_target(match[1], arms, text)
         if len(target) == 1:
-            raise _refuse(text, arms, f"'{match[1]}' is one arm, whose SR is no difference")
+            raise _refuse(text, arms, f"'{match[1]}' is a single arm, not a difference")
         return StopRule(compact, (target,), None, every)
     if match := re.fullmatch(r"width ?(?:\((.+)\))? ?< ?(\d+(?:\.\d+)?)", compact):
         targets = (_read_target(match[1], arms, text),) if match[1] else tuple((arm,) for arm in arms)

@@ -34,11 +34,11 @@ TITLES: Mapping[str, str] = {
 """Measures that tables show."""
 ABOUT: Mapping[str, str] = {
     "error": "Root mean squared error in grey levels of held-out frames after 4 actions, from another place.",
-    "regret": "How much further from the goal the chosen plan ends than the best one.",
+    "regret": "How much further from the goal the chosen plan ends than the best plan.",
     "psnr/4": "Of the same frames as the error.",
     "ssim/4": "Of the same frames as the error.",
-    "gap/displacements": "PSNR under the true actions less that under another clip's, turned to the true heading.",
-    "rank": "Kendall's tau of the plans' scores with those that true pictures give.",
+    "gap/displacements": "PSNR under the true actions minus that under another clip's, turned to the true heading.",
+    "rank": "Kendall's tau between the plans' scores and those from true images.",
 }
 
 
@@ -107,8 +107,8 @@ def explain(table: ScalingTable) -> list[str]:
         for name, values in table.references.items()
     ]
     lines.append(
-        f"Intervals: 95 %, over scenes and {table.seeds} seed{'' if table.seeds == 1 else 's'} drawn anew together; "
-        + ("one seed says nothing about others." if table.seeds == 1 else "so few seeds are a rough guide.")
+        f"Intervals: 95 %, over scenes and {table.seeds} seed{'' if table.seeds == 1 else 's'} resampled together; "
+        + ("one seed says nothing about other seeds." if table.seeds == 1 else "so few seeds are a rough guide.")
     )
     return lines
 
@@ -176,10 +176,10 @@ def _tell_split(found: ModelSplit) -> str:
     split, form = found.split, _choose_form(found.split.total.value)
     who = f"{found.model}, {found.measure}"
     if split.verdict == "no gain":
-        return f"{who}: from the smallest to the largest size there is no gain beyond chance, so nothing to split."
+        return f"{who}: from the smallest to the largest size there is no significant gain, so nothing to split."
     return (
         f"{who}: of the gain of {show_interval(split.total, form)} from the smallest to the largest size, "
-        f"{show_interval(split.share, '.0f')} % comes with the smallest size trained as long: {split.verdict}."
+        f"{show_interval(split.share, '.0f')} % is reached by the smallest size when trained as long: {split.verdict}."
     )
 
 

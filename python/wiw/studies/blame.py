@@ -83,8 +83,8 @@ def blame(
         if (reviser_options or tracker or tracker_options) and not any(pending.values()):
             store.close()
             raise ArgumentError(
-                f"blame: {base.path.parent} has nothing left to rerun, so other options of the reviser or the tracker "
-                "change nothing; leave them out to see the verdicts, or repeat reruns that ended with an error "
+                f"blame: {base.path.parent} has nothing left to rerun, so overriding options of the reviser or the "
+                "tracker has no effect; leave them out to see the verdicts, or repeat reruns that ended with an error "
                 "(--retry-errors)"
             )
         relocated = {
@@ -132,9 +132,9 @@ def _explain_refusal(base: RunStore, scheme: Scheme, arm: str, agents: Mapping[s
     stages = ", ".join(list(scheme.reruns)[:-1])
     allowed = ",".join(name for name, agent in agents.items() if scheme.allows(agent))
     todo = (
-        f"choose from the arms that have it: --arm {allowed}"
+        f"choose from the arms with that policy: --arm {allowed}"
         if allowed
-        else f"`wiw run {base.config['task'].get('task')} --policy {scheme.policy}` makes a run with such arms"
+        else f"`wiw run {base.config['task'].get('task')} --policy {scheme.policy}` starts a run with such arms"
     )
     return (
         f"arm '{arm}' answers questions with {own}; only policy '{scheme.policy}' has stages that can be rerun with "
@@ -161,8 +161,8 @@ def _make_recipes(base: RunStore, wanted: Mapping[str, set[int]]) -> tuple[Any, 
     base.require_task(built.describe())
     if scheme.needs_guide and not built.has_guide:
         raise ArgumentError(
-            f"blame: task '{base.config['task'].get('task')}' does not define the true value of a plan; derive it "
-            "from wiw.tasks.navigation.NavigationTask, or write `guide` of its environment and set `has_guide`"
+            f"blame: task '{base.config['task'].get('task')}' does not define the true value of a plan; derive it from "
+            "wiw.tasks.navigation.NavigationTask, or implement `guide` in its environment and set `has_guide`"
         )
     require_scenes(built, base, [episodes[index] for found in wanted.values() for index in found])
     return task, {

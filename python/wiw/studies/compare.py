@@ -139,7 +139,7 @@ def compare(
         names,
         (*unlike, *(line for pair in pairs for line in _describe_changes(first, second, pair))),
         unbalanced=count_unbalanced(second),
-        looks="One of the runs was looked at before it was stopped." if anytime else "",
+        looks="One of the runs was stopped early by a rule." if anytime else "",
     )
 
 
@@ -178,26 +178,28 @@ def require_comparable(
     """
     versions = [a.store.benchmark, b.store.benchmark]
     if versions[0] != versions[1]:
-        advice = "scores of unlike versions differ by the benchmark itself (docs/results.md): run the older one again"
+        advice = (
+            "scores of different versions differ because of the benchmark itself (docs/results.md): rerun the older one"
+        )
         _refuse(a, b, "version of the benchmark", versions, advice)
     ours, theirs = a.store.config, b.store.config
     for name in dict.fromkeys([*ours["task"], *theirs["task"]]):
         values = [_simplify_value(config["task"].get(name)) for config in (ours, theirs)]
         if values[0] != values[1] and name not in ("judge", *BUDGET_RULES):
-            _refuse(a, b, f"task.{name}", values, "run one of them again with the other's task, scenes and preset")
+            _refuse(a, b, f"task.{name}", values, "rerun one of them with the other's task, scenes and preset")
     if not unlike_budgets and (differing := list_unlike_budgets(a, b, pairs)):
         raise StoreError(
-            f"cannot compare {a.path} and {b.path}: their episodes have unlike budgets: {'; '.join(differing)}. A "
-            "larger budget raises success by itself: run one of them again with the other's numbers, or compare them "
-            "nevertheless with --unlike-budgets (unlike_budgets=True), and report both budgets"
+            f"cannot compare {a.path} and {b.path}: their episodes have different budgets: {'; '.join(differing)}. A "
+            "larger budget raises success by itself: rerun one of them with the other's budget, or compare them "
+            "anyway with --unlike-budgets (unlike_budgets=True) and report both budgets"
         )
     _require_same_judge(a, b)
     if ours["seed"] != theirs["seed"]:
-        _refuse(a, b, "seed", [ours["seed"], theirs["seed"]], f"run one of them again with --seed {ours['seed']}")
+        _refuse(a, b, "seed", [ours["seed"], theirs["seed"]], f"rerun one of them with --seed {ours['seed']}")
     episodes = a.store.episodes(), b.store.episodes()
     if len(episodes[0]) != len(episodes[1]):
         counts = [len(one) for one in episodes]
-        _refuse(a, b, "episodes", counts, f"run the shorter one again with --episodes {max(counts)}")
+        _refuse(a, b, "episodes", counts, f"rerun the shorter one with --episodes {max(counts)}")
     for index, pair in enumerate(zip(*episodes, strict=True)):
         _require_same_episode(a, b, index, pair)
 
@@ -213,7 +215,7 @@ def list_unlike_budgets(a: RunLog, b: RunLog, pairs: Sequence[tuple[str, str]]) 
     for pair in pairs:
         executed = [_count_executed(log, arm) for log, arm in zip((a, b), pair, strict=True)]
         if None not in executed and executed[0] != executed[1]:
-            found.append(f"{_label(pair[1], pair[0])} carries out {executed[0]} and {executed[1]} actions per decision")
+            found.append(f"{_label(pair[1], pair[0])} executes {executed[0]} and {executed[1]} actions per decision")
     return found
 
 
@@ -233,10 +235,10 @@ def _require_same_judge(a: RunLog, b: RunLog) -> None:
     if digests[0] != digests[1]:
         known = [{judge.digest: judge for judge in log.store.judges} for log in (a, b)]
         common = [judge.full_label for digest, judge in known[0].items() if digest in known[1]]
-        judged = f"both have marks by {common[0]}: name that with judge= or --judge" if common else ""
-        remedy = judged or "judge both with the same judge (`wiw judge`), then name it with judge= or --judge"
+        judged = f"both have marks by {common[0]}: choose it with judge= or --judge" if common else ""
+        remedy = judged or "judge both with the same judge (`wiw judge`), then choose it with judge= or --judge"
         labels = ["no judge" if judge is None else judge.full_label for judge in judges]
-        _refuse(a, b, "judge", labels, f"marks of unlike judges are not comparable; {remedy}")
+        _refuse(a, b, "judge", labels, f"marks from different judges are not comparable; {remedy}")
 
 
 def _require_same_episode(a: RunLog, b: RunLog, index: int, pair: tuple[Episode, Episode]) -> None:
@@ -245,9 +247,9 @@ def _require_same_episode(a: RunLog, b: RunLog, index: int, pair: tuple[Episode,
     for name in described[0]:
         values = [_simplify_value(one[name]) for one in described]
         if values[0] != values[1]:
-            _refuse(a, b, f"episode {index}: {name}", values, "they ran on different episodes; run one of them again")
+            _refuse(a, b, f"episode {index}: {name}", values, "they ran on different episodes; rerun one of them")
     if all(map(math.isfinite, lengths)) and abs(lengths[0] - lengths[1]) > LENGTH_TOLERANCE:
-        advice = "the scene itself has changed (its file, or its navigation mesh); run one of them again"
+        advice = "the scene itself has changed (its file or its navigation mesh); rerun one of them"
         _refuse(a, b, f"episode {index}: shortest path", lengths, advice)
 
 
@@ -267,7 +269,9 @@ def _refuse(a: RunLog, b: RunLog, field: str, values: Sequence[Any], advice: str
 
 def _list_pairs(a: RunLog, b: RunLog, arm: str | None, other: str | None) -> list[tuple[str, str]]:
     if other is not None and arm is None:
-        raise ArgumentError(f"compare: other='{other}' names an arm of the second run; arm= must name one of the first")
+        raise ArgumentError(
+            f"compare: other='{other}' names an arm of the second run; also name one of the first with arm="
+        )
     if arm is not None:
         pair = arm, other or arm
         for log, name in ((a, pair[0]), (b, pair[1])):
@@ -280,8 +284,8 @@ def _list_pairs(a: RunLog, b: RunLog, arm: str | None, other: str | None) -> lis
     if len(a.arms) == len(b.arms) == 1:
         return [(a.arms[0], b.arms[0])]
     raise ArgumentError(
-        f"compare: {a.path} has arms {', '.join(a.arms)}, {b.path} has {', '.join(b.arms)}: none in common; "
-        "name one of each (arm= and other=, or --arm and --other)"
+        f"compare: {a.path} has arms {', '.join(a.arms)}, {b.path} has {', '.join(b.arms)}: none in common; name one "
+        "of each (arm= and other=, or --arm and --other)"
     )
 
 
@@ -310,7 +314,7 @@ def _describe_changes(a: RunLog, b: RunLog, pair: tuple[str, str]) -> list[str]:
     differing = [name for name in names if described[0].get(name) != described[1].get(name)]
     label = _label(pair[1], pair[0])
     if not differing:
-        return [f"{label}: same agent in both runs."]
+        return [f"{label}: the same agent in both runs."]
     details = [f"{name} {to_json(described[0].get(name))} -> {to_json(described[1].get(name))}" for name in differing]
     more = f", and {len(details) - MOST_NAMED} more" if len(details) > MOST_NAMED else ""
     return [f"{label}: {', '.join(details[:MOST_NAMED])}{more}."]

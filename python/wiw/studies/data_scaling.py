@@ -158,7 +158,9 @@ def make_plan(data: Path, settings: ScalingSettings) -> ScalingPlan:
     trained, held_out = (NavigationData(data, part, settings.held_out) for part in ("train", "held-out"))
     require_panoramas("data-scaling", NavigationCorpus(trained, "train"))
     if not trained.meta["config"]["depth"]:
-        raise ArgumentError(f"data-scaling: expected a dataset with depth, got {data}; collect it without --no-depth")
+        raise ArgumentError(
+            f"data-scaling: expected a dataset with depth, got {data}, which has none; collect it without --no-depth"
+        )
     if not len(held_out) or not len(trained):
         raise ArgumentError(
             f"data-scaling: expected scenes to train on and others held out, got {len(trained)} segments to train on "
@@ -168,7 +170,7 @@ def make_plan(data: Path, settings: ScalingSettings) -> ScalingPlan:
     if len(clips) < settings.clips:
         raise ArgumentError(
             f"data-scaling: expected {settings.clips} clips of {settings.length} frames in scenes to train on, got "
-            f"{len(clips)}; collect more scenes, or ask for fewer (--clips {len(clips)})"
+            f"{len(clips)}; collect more scenes, or use fewer clips (--clips {len(clips)})"
         )
     _, windows = np.unique(list_scenes(trained, clips), return_counts=True)
     sizes = choose_sizes(settings.clips, settings.batch, settings.sizes)
@@ -193,8 +195,10 @@ def write_plan(plan: ScalingPlan, folder: Path) -> None:
     except (OSError, ValueError, TypeError) as error:
         raise FileError(f"{path}: expected the plan of a study, got {error}; name another folder with --out") from error
     if differing := [name for name in {**asked, **there} if there.get(name) != asked.get(name)]:
-        said = ", ".join(f"{name} {there.get(name)} there and {asked.get(name)} asked" for name in differing)
-        raise ArgumentError(f"{folder} holds another study: {said}; ask for the same, or name another with --out")
+        said = ", ".join(f"{name} was {there.get(name)}, now {asked.get(name)}" for name in differing)
+        raise ArgumentError(
+            f"{folder} holds a different study: {said}; repeat it with the same settings, or choose another with --out"
+        )
 
 
 def _collect(folder: Path, workers: int, watch: Watch) -> Path:

@@ -136,9 +136,9 @@ def benchmark_device(
         found += _measure_networks(networks, rows, seconds, devices, not_run, progress)
     peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 2**10
     notes = [
-        f"This process took {peak:.0f} MB of main memory at most; load {os.getloadavg()[0]:.1f} at the end.",
-        "A training step is a pass, the mean square of its outputs, the gradient and AdamW. The diffuser has random "
-        "weights, for none are shipped.",
+        f"Peak memory of this process: {peak:.0f} MB; load {os.getloadavg()[0]:.1f} at the end.",
+        "A training step is a forward pass, the mean square of its outputs, the backward pass and AdamW. The diffuser "
+        "has random weights, as none are shipped.",
     ]
     return DeviceBenchmark(devices, describe_platform(), found, not_run, notes)
 
@@ -178,16 +178,16 @@ def _find_backends(devices: dict[str, str], not_run: list[str]) -> list[Backend]
     try:
         usable = [device for device in render.egl_devices() if not device["error"]]
     except BackendError as error:
-        not_run.append(f"rendering by EGL: {error}")
+        not_run.append(f"rendering with EGL: {error}")
         return ["cpu"]
     if not usable:
-        not_run.append("rendering by EGL: no device gives an OpenGL context")
+        not_run.append("rendering with EGL: no device provides an OpenGL context")
         return ["cpu"]
     hardware = [device for device in usable if not device["software"]]
     chosen = (hardware or usable)[0]
     devices["egl"] = f"{chosen['renderer']}, OpenGL {chosen['version']}{'' if hardware else ' (software)'}"
     if not hardware:
-        not_run.append(f"rendering by EGL on a hardware device: there is only {devices['egl']}")
+        not_run.append(f"rendering with EGL on a hardware device: there is only {devices['egl']}")
     return ["cpu", "gpu"]
 
 

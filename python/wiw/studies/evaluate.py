@@ -145,12 +145,12 @@ def resume_run(
     try:
         place = EngineConfig(**{**store.info.get("engine", {}), **given})
         if place.engine != "ray" and given.get("address") is not None:
-            raise ArgumentError("resume: address is for engine ray: give --engine ray (engine=) as well")
+            raise ArgumentError("resume: address requires engine ray: give --engine ray (engine=) as well")
         if place.engine != "ray":  # each worker has its own model then
             place = EngineConfig(engine=place.engine)
         if "attributes" in store.config:
             own, whole = store.path.parent, store.path.parent.parent
-            raise StoreError(f"{own} holds the reruns of `wiw blame {whole}`; resume them by that command")
+            raise StoreError(f"{own} holds the reruns of `wiw blame {whole}`; resume them with that command")
         task, agents = read_recipes(store)
         update_own_sources(store, task, agents)
         built = task.build()
@@ -232,7 +232,7 @@ def _choose_salt(settings: RunConfig) -> str:
     """
     if settings.salt is None and settings.shard is not None:
         raise ArgumentError(
-            f"evaluate: shard {settings.shard} without a salt, which all shards of a run have in common; give each of "
+            f"evaluate: shard {settings.shard} without a salt, which all shards of a run must share; give each of "
             f"them, say, --salt {keys.draw_salt()} (salt=)"
         )
     return keys.draw_salt() if settings.salt is None else settings.salt
@@ -256,8 +256,8 @@ def _add_arms(store: RunStore, config: dict[str, Any], info: Mapping[str, Any]) 
     if "until" in store.info:
         store.close()
         raise StoreError(
-            f"{store.path}: a run that a rule may stop early (--until) has the arms that it was begun with; run the "
-            "new ones in another folder"
+            f"{store.path}: a run that a rule may stop early (--until) keeps the arms that it was started with; run "
+            "the new ones in another folder"
         )
     store.add_arms(config, info)
 

@@ -158,7 +158,7 @@ class _Marking:
                     outcome = done.result()
                     in_a_row = in_a_row + 1 if isinstance(outcome, VlmError) else 0
                     if in_a_row >= max(SERVER_ERRORS, width) and waiting:
-                        self.stopped = f"{len(waiting)} answers were not asked about, since the last {in_a_row} ended "
+                        self.stopped = f"{len(waiting)} answers were not judged, as the last {in_a_row} ended "
                         self.stopped += f"with an error of the language model: {outcome}"
                     yield running.pop(done), outcome
         finally:
@@ -194,7 +194,7 @@ class _Marking:
                 continue
             found = judged.get((arm, episode))
             if found is None:
-                yield MissingMarks(arm, episode, "not asked about yet", "judge/missing")
+                yield MissingMarks(arm, episode, "not requested yet", "judge/missing")
             elif found["status"] == "error":
                 yield MissingMarks(arm, episode, found["error"], found["kind"])
 
@@ -241,12 +241,12 @@ def _find_task(store: RunStore) -> Any:
     task, recipe = store.config["task"].get("task"), store.info["task"]
     if not store.judges:
         raise StoreError(
-            f"{store.path.parent} is a run of task '{task}', whose outcomes do not depend on a judge; expected one "
+            f"{store.path.parent} is a run of task '{task}', whose outcomes do not depend on a judge; expected a task "
             "with answers in words, such as aeqa"
         )
     if not recipe and task not in TASKS.names():
         raise StoreError(
-            f"{store.path.parent} was begun with a task in memory, '{task}', that is not registered; register it in "
-            "the entry points 'wiw.tasks' (docs/write-your-own-task.md)"
+            f"{store.path.parent} was started with a task in memory, '{task}', that is not registered; register it "
+            "under the entry points 'wiw.tasks' (docs/write-your-own-task.md)"
         )
     return task_class(recipe["name"] if recipe else task)

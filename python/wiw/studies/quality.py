@@ -173,7 +173,9 @@ def quality(
         chosen, notes = _choose_arms(logs, arms)
         keys = _choose_frames(chosen, frames)
         if len(keys) < frames:
-            notes.append(f"{frames} frames were asked for; all arms have imagined the same future in {len(keys)} only.")
+            notes.append(
+                f"{frames} frames were requested, but all arms have imagined the same future in only {len(keys)}."
+            )
         for arm in chosen:
             arm.frames = dict(read_frames(arm.log.store, arm.places, keys))
         _find_truth(logs, chosen, keys)
@@ -181,7 +183,7 @@ def quality(
         cards = _score_all([ALWAYS, *scorers], chosen, stores, _Scoring(deadline, workers, place, watch))
         _compare_with_truth(chosen, stores, judged, watch)
         if not any(arm.true for arm in chosen):
-            notes.append("No true frames, so no controllability: run with --fidelity, or with arm oracle.")
+            notes.append("No controllability, as there are no true frames: run with --fidelity, or with an oracle arm.")
         table = _summarise(chosen, cards, notes, logs[0])
     folder = Path(out) if out is not None else logs[0].path / "quality"
     return Quality(table, folder, _choose_pictures(chosen, keys))
@@ -217,9 +219,9 @@ def _choose_arms(logs: Sequence[RunLog], wanted: Sequence[str] | None) -> tuple[
     if len(without) == len(found):
         raise ArgumentError(
             f"quality: no imagined frames of {', '.join(without)} in {', '.join(str(log.path) for log in logs)}; run "
-            "world models and keep pictures (`wiw run --keep-images N`, or keep_images=)"
+            "world models and keep images (`wiw run --keep-images N`, or keep_images=)"
         )
-    notes = [f"Left out, for no imagined frames of them are kept: {', '.join(map(repr, without))}."] if without else []
+    notes = [f"Left out, as no imagined frames of them were kept: {', '.join(map(repr, without))}."] if without else []
     return [arm for arm in found if arm.places], notes
 
 
@@ -237,8 +239,8 @@ def _choose_frames(arms: Sequence[_Arm], count: int) -> list[FrameKey]:
     if not keys:
         counts = ", ".join(f"{arm.label} {len(arm.places)}" for arm in arms)
         raise ArgumentError(
-            f"quality: expected frames that all arms have imagined from the same place for the same plan, got none in "
-            f"common ({counts}); compare arms of one policy and one kind of view with arms= or --arms"
+            "quality: expected frames that all arms have imagined from the same place for the same plan, got none in "
+            f"common ({counts}); choose arms with the same policy and kind of view with arms= or --arms"
         )
     return sample_frames(keys, count)
 
@@ -274,7 +276,7 @@ def _score_all(
             taken = {name for one in cards for name in one["scores"]} | {CONTROL_BY_LPIPS, CONTROL_BY_SSIM, "q"}
             if both := sorted(taken & set(card.scores)):
                 raise ArgumentError(
-                    f"quality: scorer '{spec}' gives {both[0]}, a name that is taken; let it give the score another one"
+                    f"quality: scorer '{spec}' gives {both[0]}, a name that is already taken; rename its score"
                 )
             cards.append({**card.as_dict(), "command": spec})
             _score(scorer, spec, arms, stores, scoring)
@@ -317,8 +319,8 @@ def _ask(scorer: Scorer, images: Mapping[str, Image]) -> Iterator[tuple[str, dic
         for path, digest in paths.items():
             if not cv2.imwrite(str(path), cv2.cvtColor(images[digest], cv2.COLOR_RGB2BGR)):
                 raise FileError(
-                    f"{path}: cannot be written; expected free space for {len(paths)} frames among temporary "
-                    "files: make room, or name another folder by the environment variable TMPDIR"
+                    f"{path}: cannot be written; expected room for {len(paths)} frames in the temporary folder: free "
+                    "some space, or choose another folder with the environment variable TMPDIR"
                 )
         for path, scores in scorer.score(list(paths)):
             yield paths[path], scores
@@ -363,7 +365,7 @@ class BatchScorer:
             if scorer.card.digest != self._card.digest:
                 raise ScorerError(
                     f"scorer '{self._spec}' is {scorer.card.label} on a machine of the cluster, expected "
-                    f"{self._card.label} as here; install the same on all"
+                    f"{self._card.label} as here; install the same one everywhere"
                 )
             found = dict(_ask(scorer, images))
         return {"digest": list(found), "scores": [json.dumps(scores) for scores in found.values()]}
@@ -451,8 +453,8 @@ def _read_outcomes(arms: Sequence[_Arm]) -> tuple[Metric, dict[str, dict[int, fl
         if set.intersection(*map(set, values.values())):
             return metric, values
     raise ArgumentError(
-        f"quality: expected episodes that are scored in all of {', '.join(done)}, got none; let the run go on "
-        "(`wiw resume`), or name other arms"
+        f"quality: expected episodes that are scored in all of {', '.join(done)}, got none; continue the run (`wiw "
+        "resume`), or choose other arms"
     )
 
 

@@ -128,8 +128,8 @@ def scale(
     own, task_options = take_settings(config, settings)
     if own.shard is not None:
         raise ArgumentError(
-            "scale: a curve needs all episodes, so it takes no shard; expected none, or `wiw run --shard` for each "
-            "number of candidates"
+            "scale: a curve needs all episodes, so --shard is not supported; use `wiw run --shard` for each number of "
+            "candidates instead"
         )
     out = own.out or Path("runs") / f"scale-{datetime.now():%Y%m%d-%H%M%S}"
     run_config = replace(own, out=out, keep_images=0, episodes=own.episodes or EPISODES)

@@ -145,7 +145,9 @@ def _require(run: StudyRun) -> None:
         agent.describe()
         agent.require(task, count)
         if run.quality is not None and not agent.is_named:
-            raise ArgumentError(f"study: {run.name}: arm '{arm}' is no name; quality is measured of stored runs")
+            raise ArgumentError(
+                f"study: {run.name}: arm '{arm}' is not a name; quality can only be measured on stored runs"
+            )
 
 
 def _run(run: StudyRun, folder: Path, workers: int, progress: bool) -> StudyPart:
