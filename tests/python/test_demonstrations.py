@@ -314,7 +314,7 @@ def test_the_command_line(tmp_path: Path, capsys: pytest.CaptureFixture[str]) ->
     assert "1 demonstrations of 16 frames" in printed.out and "failed at 0 tables" in printed.out
     assert "slide_block: 1/1 demonstrations" in printed.err
     assert main([*arguments, "--size", "96", "--out", str(out)]) == 2
-    assert "size 64 there and 96 asked" in capsys.readouterr().err
+    assert "size was 64, now 96" in capsys.readouterr().err
 
 
 # -- what cannot be ----------------------------------------------------------------------------------------------------

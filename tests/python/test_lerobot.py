@@ -394,7 +394,7 @@ def write(file: str, text: str) -> Callable[[Path], None]:
         (drop_column(EPISODE_FILE, "scene"), "got no scene"),
         (set_column(EPISODE_FILE, "file", "../elsewhere.parquet"), "in the new folder, got ../elsewhere"),
         (set_column(EPISODE_FILE, "file", "/elsewhere.parquet"), "in the new folder, got /elsewhere"),
-        (set_column(FRAME_FILE, RGB, None), f"pictures of {RGB} in it, got some missing"),
+        (set_column(FRAME_FILE, RGB, None), f"images of {RGB} in it, but some are missing"),
         (set_column(FRAME_FILE, "index", 3), "expected frames 0 to .* of episode 0, got others"),
         (cut_short(FRAME_FILE), "got a damaged one"),
         (cut_short(EPISODE_FILE), "damaged file"),
@@ -433,7 +433,7 @@ def test_what_cannot_be_exported_is_told(navigation: Path, manipulation: Path, t
         export_lerobot(navigation, tmp_path / "out", workers=0)
     begun = shutil.copytree(navigation, tmp_path / "begun")
     (begun / "meta.json").unlink()
-    with pytest.raises(FileError, match="repeat `wiw collect navigation` until it is finished"):
+    with pytest.raises(FileError, match="repeat that command until it finishes"):
         export_lerobot(begun, tmp_path / "out")
     (tmp_path / "full").mkdir()
     (tmp_path / "full" / "mine").write_text("kept")

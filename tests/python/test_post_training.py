@@ -395,7 +395,7 @@ def test_sigterm_writes_the_state_and_other_numbers_do_not_resume(
     assert "Repeat the command to resume" in capsys.readouterr().err
     assert torch.load(tmp_path / "out.checkpoint", weights_only=True)["step"] == 3 and not out.exists()
     options: dict[str, Any] = {"weights": weights(name), "device": "cpu", "part": "all"}
-    with pytest.raises(ArgumentError, match="other data or options"):
+    with pytest.raises(ArgumentError, match="different data or options"):
         post_train(name, data, out, recipe=tiny_recipe(name, epochs=5, seed=1), **options)
 
 

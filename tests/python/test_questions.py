@@ -358,7 +358,7 @@ def test_episodes_of_one_scene_take_turns_in_categories() -> None:
 
 
 def test_a_scene_without_rooms_is_a_typed_error(two_rooms: str) -> None:
-    with pytest.raises(ArgumentError, match="tells its rooms"):
+    with pytest.raises(ArgumentError, match="expected a scene with rooms"):
         generate.generate(world(two_rooms, "cpu"), 1, 0)
 
 

@@ -109,7 +109,7 @@ FIRST_LOOKS = (HIDDEN_LOOK, SMALL_LOOK, AVERTED_LOOK)
 FRONTLESS = ("bin", "floor lamp", "laundry basket", "plant", "stool", "table lamp")
 """Categories that look alike from all sides."""
 
-LABELS_NEEDED = "put the files with its labels beside its mesh (docs/real-scans.md)"
+LABELS_NEEDED = "put the files with its labels next to its mesh (docs/real-scans.md)"
 HIDDEN = (0.4, 0.2)
 """Visible shares at the start below which an episode is of difficulty 1 and 2."""
 
@@ -180,11 +180,11 @@ def centre_of(world: World, instance: int, where: str) -> NDArray[np.float64]:
     """
     things = world.scene.instances
     if not 1 <= instance <= len(things):
-        raise ArgumentError(f"{where}: target {instance} is no instance of {world.name}, which has 1 to {len(things)}")
-    if world.scene.attributes.get("labels") == "none":
         raise ArgumentError(
-            f"{where}: {world.name} has no labels, so that target {instance} is unknown; {LABELS_NEEDED}"
+            f"{where}: target {instance} is not an instance of {world.name}, which has 1 to {len(things)}"
         )
+    if world.scene.attributes.get("labels") == "none":
+        raise ArgumentError(f"{where}: {world.name} has no labels, so target {instance} is unknown; {LABELS_NEEDED}")
     if not things[instance - 1]["triangle_count"]:
         raise ArgumentError(f"{where}: target {instance} has no surface in {world.name}")
     return np.asarray(things[instance - 1]["bounds"], np.float64).mean(axis=0)
@@ -226,7 +226,7 @@ def generate(
             if len(made) == count:
                 return [_number_episode(episode, first + i) for i, episode in enumerate(made)]
     raise ArgumentError(
-        f"{world.name}: only {len(made)} of {count} targets and starts satisfy {rules}; ask for fewer in a scene"
+        f"{world.name}: only {len(made)} of {count} targets and starts satisfy {rules}; request fewer per scene"
     )
 
 
@@ -243,8 +243,9 @@ def _targets(world: World, categories: Sequence[str]) -> dict[str, list[Mapping[
             things.setdefault(category_of(instance), []).append(instance)
     if not things:
         raise ArgumentError(
-            f"{world.name}: holds nothing of the categories {', '.join(categories)}; it has "
-            f"{', '.join(sorted(world.scene.categories)) or 'none at all'}: name those wanted (categories=[...])"
+            f"{world.name}: has no object of the categories {', '.join(categories)}; it has "
+            f"{', '.join(sorted(world.scene.categories)) or 'none at all'}: choose the categories to use "
+            "(categories=[...])"
         )
     return things
 
@@ -505,8 +506,8 @@ def load(
     for i, episode in enumerate(found):
         if episode.info["category"] not in named:
             raise FileError(
-                f"{path}: episode {i}: info.category '{episode.info['category']}' is none of the categories "
-                f"{', '.join(named)}; correct the file, or name it too (categories=[...])"
+                f"{path}: episode {i}: info.category '{episode.info['category']}' is not among the categories "
+                f"{', '.join(named)}; correct the file, or add it (categories=[...])"
             )
     return found, tuple(named)
 
@@ -526,4 +527,4 @@ def _check_fields(episode: Episode, where: str) -> None:
     if isinstance(target, bool) or not isinstance(target, int) or target < 1:
         raise FileError(f"{where}: info.target: expected the id of an instance (1, 2, ...), got {target!r}")
     if not isinstance(category, str) or not category:
-        raise FileError(f"{where}: info.category: expected what the target is, got {category!r}")
+        raise FileError(f"{where}: info.category: expected the target's category, got {category!r}")

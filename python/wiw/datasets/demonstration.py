@@ -124,7 +124,8 @@ def decode_pictures(pictures: Sequence[bytes], how: int) -> NDArray[Any]:
         return np.stack(whole)
     except (ValueError, cv2.error) as error:
         raise FileError(
-            f"a picture of a demonstration is damaged ({error}); delete its file, then `wiw collect` makes it anew"
+            f"a picture of a demonstration is damaged ({error}); delete its file and repeat `wiw collect` to recreate "
+            "it"
         ) from error
 
 

@@ -102,7 +102,7 @@ def read_json(path: str | Path) -> Any:
             raw = file.read(MOST_BYTES + 1)
         if len(raw) > MOST_BYTES:
             raise ValueError(
-                f"expected an episode file of at most {MOST_BYTES} bytes when unpacked, and it holds more; split it"
+                f"expected an episode file of at most {MOST_BYTES} bytes when unpacked, but it is larger; split it"
             )
         return parse_json(raw)
     except (OSError, EOFError, ValueError, zlib.error) as error:

@@ -126,7 +126,7 @@ class NavigationSegment:
     def _show(self, pictures: Sequence[bytes | None], how: int) -> NDArray[Any]:
         decoded = {int(source): self._decode(pictures, int(source), how) for source in np.unique(self.sources)}
         if len({image.shape for image in decoded.values()}) > 1:
-            raise FileError(f"{self._name}: expected pictures of one size, got several; {_REMEDY}")
+            raise FileError(f"{self._name}: expected images of one size, got several; {_REMEDY}")
         return np.stack(
             [np.roll(decoded[int(i)], int(roll), axis=1) for i, roll in zip(self.sources, self.rolls, strict=True)]
         )
@@ -140,7 +140,7 @@ class NavigationSegment:
             except cv2.error:
                 image = None
         if image is None:
-            raise FileError(f"{self._name}: expected a picture in frame {frame}, got something else; {_REMEDY}")
+            raise FileError(f"{self._name}: expected an image in frame {frame}, got something else; {_REMEDY}")
         return image
 
     @property
@@ -148,7 +148,7 @@ class NavigationSegment:
         return f"{self.scene}, segment {self.segment}"
 
 
-_REMEDY = "`wiw data verify` finds the damaged file; delete it, then `wiw collect` makes it anew"
+_REMEDY = "`wiw data verify` finds the damaged file; delete it and repeat `wiw collect` to recreate it"
 
 
 def encode_color(image: NDArray[np.uint8], lossless: bool) -> bytes:

@@ -115,7 +115,7 @@ class RowGroupFile:
             self._metadata = parquet.read_metadata(path)
             self.facts: dict[str, Any] = json.loads(self._metadata.metadata[KEY])
         except FileNotFoundError as error:
-            raise FileError(f"{path} is missing; make it with `wiw collect`, asked for the same again") from error
+            raise FileError(f"{path} is missing; recreate it by repeating the `wiw collect` command") from error
         except (OSError, ArrowException, KeyError, TypeError, ValueError) as error:
             raise self.build_damage_error(error) from error
         if self.facts.get("format") != form:
@@ -146,6 +146,6 @@ class RowGroupFile:
     def build_damage_error(self, error: Exception) -> FileError:
         """Return the error that tells what to do about a damaged file."""
         return FileError(
-            f"{self.path}: expected a whole file of {self._what}, got a damaged one ({error}); delete it, then "
-            "`wiw collect`, asked for the same again, makes it anew"
+            f"{self.path}: expected a complete file of {self._what}, got a damaged one ({error}); delete it and "
+            "recreate it by repeating the `wiw collect` command"
         )

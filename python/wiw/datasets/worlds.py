@@ -92,7 +92,7 @@ def open_navmesh(path: Path | None, scene: Scene) -> NavMesh:
     if (low < scene.bounds[0] - SLACK).any() or (high > scene.bounds[1] + SLACK).any():
         raise FileError(
             f"{path}: its mesh reaches from {low.round(1)} to {high.round(1)}, the scene from "
-            f"{scene.bounds[0].round(1)} to {scene.bounds[1].round(1)} (metres, Y up): expected the mesh of this very "
-            "scene; take the file away to have one built"
+            f"{scene.bounds[0].round(1)} to {scene.bounds[1].round(1)} (metres, Y up): expected the navigation mesh of "
+            "this scene; remove the file to have one built"
         )
     return navmesh

@@ -79,8 +79,8 @@ class Checkpoint:
             raise FileError(f"{self.path}: damaged ({error}); delete it to start again") from error
         if identity != self._identity:
             raise ArgumentError(
-                f"{self.path} is the checkpoint of a training with other data or options; delete it to start again, "
-                "or resume with the same options"
+                f"{self.path} is the checkpoint of a training with different data or options; delete it to start "
+                "again, or resume with the same options"
             )
         return state
 

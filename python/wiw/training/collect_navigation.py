@@ -108,7 +108,7 @@ def collect_navigation(
         raise InfrastructureError(
             f"collect: {len(errors)} of {len(specs)} scenes cannot be recorded, the others are: "
             + "; ".join(f"{scene}: {error}" for scene, error in errors.items())
-            + ". Mend them and repeat the command, or leave them out with --skip-errors"
+            + ". Fix them and repeat the command, or skip them with --skip-errors"
         )
     if len(finished) < len(jobs) or not (folder / META).exists():
         _finish(folder, config, options, [records[number] for number in sorted(records)], errors)
@@ -162,8 +162,8 @@ def _check_train_split(spec: str) -> None:
     """Refuse scenes on which world models are evaluated."""
     if (split := find_evaluation_split(spec)) is not None:
         raise ArgumentError(
-            f"collect: expected scenes of a train split, got {spec}, which is of {split}: evaluation runs there; a "
-            "model trained on it would be tested on what it has seen. Name train scenes, such as apartments:train:80"
+            f"collect: expected scenes of a train split, got {spec}, which is of {split}: a model trained on scenes "
+            "used for evaluation would be tested on what it has seen. Choose train scenes, such as apartments:train:80"
         )
 
 

@@ -30,7 +30,7 @@ def calibrate(views: LabelledViews, seed: int, steps: int = STEPS) -> ColorNamer
         ArgumentError: the views show nothing of a known colour.
     """
     if not len(views.pixels):
-        raise ArgumentError("expected scenes with things of known colours, got none; name others (--scenes)")
+        raise ArgumentError("expected scenes with objects of known colours, got none; choose others (--scenes)")
     features = compute_features(views.pixels)
     shift, scale = features.mean(axis=0), 1 / (features.std(axis=0) + 1e-3)
     inputs = torch.from_numpy(((features - shift) * scale).astype(np.float32))

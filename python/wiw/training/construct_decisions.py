@@ -84,9 +84,7 @@ def collect_decisions(
         parts.append(construct_decisions(world(name), per_scene, seed, rules))
         progress(name, done, len(names))
     if not any(map(len, parts)):
-        raise ArgumentError(
-            f"decisions: {specs} has no place from where {rules.plans} ways are free; name other scenes"
-        )
+        raise ArgumentError(f"decisions: {specs} has no place with {rules.plans} free directions; choose other scenes")
     return join_decisions([part for part in parts if len(part)])
 
 

@@ -226,8 +226,8 @@ def gather_arrays(sources: Mapping[str, str], job: Job, folder: Path, workers: i
 def _require_arrays(arrays: Arrays | None, file: Path, job: Job) -> Arrays:
     if arrays is None:
         raise FileError(
-            f"{job.name}: {file} was written and cannot be read back; is something else deleting or writing files "
-            "there? Repeat the command, or choose another folder by --cache"
+            f"{job.name}: {file} was written but cannot be read back; is something else deleting or writing files "
+            "there? Repeat the command, or choose another folder with --cache"
         )
     return arrays
 

@@ -79,7 +79,7 @@ def merge_glimpse_sets(parts: Sequence[GlimpseSets]) -> GlimpseSets:
         ArgumentError: there is not one set in them.
     """
     if not sum(len(part) for part in parts):
-        raise ArgumentError("expected scenes that show things of the categories, got none; name others (--scenes)")
+        raise ArgumentError("expected scenes with objects of the categories, got none; choose others (--scenes)")
     return join_glimpse_sets(parts)
 
 

@@ -122,5 +122,7 @@ def require_places(parts: Sequence[GoalPlaces]) -> Sequence[GoalPlaces]:
     """
     usable = [part for part in parts if np.isfinite(part.distances).sum() > len(part)]  # each is 0 m from itself
     if not usable:
-        raise ArgumentError("expected scenes in which one can walk from a place to another, got none; name others")
+        raise ArgumentError(
+            "expected scenes in which an agent can walk from one place to another, got none; choose others"
+        )
     return usable

@@ -93,7 +93,7 @@ def merge_views(parts: Sequence[LabelledViews]) -> LabelledViews:
         ArgumentError: there is not one view in them.
     """
     if not sum(map(len, parts)):
-        raise ArgumentError("expected scenes in which one can stand, got none; name others (--scenes)")
+        raise ArgumentError("expected scenes with walkable floor, got none; choose others (--scenes)")
     return LabelledViews(*(np.concatenate([getattr(part, name) for part in parts]) for name in FIELDS))
 
 

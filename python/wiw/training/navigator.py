@@ -332,7 +332,8 @@ def evaluate(
     ]
     if not parts:
         raise ArgumentError(
-            f"navigator: expected held-out scenes with two places within {FAR:g} m of each other, got none; name others"
+            f"navigator: expected held-out scenes with two places within {FAR:g} m of each other, got none; choose "
+            "others"
         )
     metres = np.concatenate([part.metres for part in parts])
     similarity = np.concatenate([part.similarity for part in parts])

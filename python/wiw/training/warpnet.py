@@ -206,12 +206,12 @@ def evaluate(
     names = scenes.resolve(specs)
     rows = [
         row
-        for name in bar(names, f"measuring on {specs}", len(names))
+        for name in bar(names, f"evaluating on {specs}", len(names))
         for row in _evaluate_scene(model, name, seed, paths)
     ]
     if not rows:
         raise ArgumentError(
-            f"{specs}: nowhere are {EVALUATED_STEPS[-1] * STRIDE:.1f} m free ahead; name others (--val)"
+            f"{specs}: nowhere is {EVALUATED_STEPS[-1] * STRIDE:.1f} m of free floor ahead; choose others (--val)"
         )
     means = {
         measure: {

@@ -162,5 +162,5 @@ def _encode_metres(depth: NDArray[np.float32]) -> bytes:
 def _decode_metres(encoded: bytes) -> NDArray[np.float32]:
     image = cv2.imdecode(np.frombuffer(encoded, np.uint8), cv2.IMREAD_UNCHANGED)
     if image is None or image.ndim != 2 or image.dtype != np.float32:
-        raise FileError("expected depth as TIFF of one float32 a pixel, got something else; copy the dataset again")
+        raise FileError("expected depth as TIFF with one float32 per pixel, got something else; copy the dataset again")
     return np.asarray(image, np.float32)

@@ -57,7 +57,7 @@ def write_dataset(
         FileError: the folder holds something already or cannot be written, or a picture of an episode is damaged.
     """
     if fps < 1:
-        raise ArgumentError(f"expected 1 frame a second or more, got {fps}")
+        raise ArgumentError(f"expected at least 1 frame per second, got {fps}")
     with atomic_folder(out) as folder:
         writer = _Writer(folder, features, fps)
         for episode in episodes:

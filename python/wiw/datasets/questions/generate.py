@@ -218,8 +218,9 @@ def look_around(
         table = observe_table(place, views, attributes, rules.clear)
     if not table.rooms:
         raise ArgumentError(
-            f"{place.name}: expected a scene that tells its rooms, such as apartments:val/3, or whose instances have "
-            "names that give rooms away, such as bed and stove; other questions come from a file (episode_file=...)"
+            f"{place.name}: expected a scene with rooms, such as apartments:val/3, or one whose instances have names "
+            "from which rooms can be inferred, such as bed and stove; for other scenes give questions in a file "
+            "(episode_file=...)"
         )
     return Surroundings(place, table, views, rules, seed)
 
@@ -270,7 +271,7 @@ def generate(
         free = [each for each in pool if each.text not in texts and _within_limits(each, made, rules)]
         if not free:
             raise ArgumentError(
-                f"{world.name}: only {len(made)} of {count} questions satisfy {rules}; ask for fewer in a scene"
+                f"{world.name}: only {len(made)} of {count} questions satisfy {rules}; request fewer per scene"
             )
         chosen = min(
             free,

@@ -202,14 +202,18 @@ def phrase(template: str, slots: Mapping[str, str]) -> str:
         if re.fullmatch(_SLOTS.get(name, _THING), word) is None or (
             name in _PLURALS and singular(plural(word)) != word
         ):
-            raise ArgumentError(f"slot {name} of '{template}': '{word}' cannot be told from the words around it")
+            raise ArgumentError(
+                f"slot {name} of '{template}': '{word}' cannot be distinguished from the words around it"
+            )
     words = {name: plural(word) if name in _PLURALS else word for name, word in slots.items()}
     text = re.sub(r"\[(.*?{(\w+)}.*?)\]", lambda part: part[1] if part[2] in words else "", kind.pattern)
     text = text.format(**words)
     text = re.sub(r"\ba (?=[aeiou])", "an ", text)
     found = parse(text)
     if found is None or found.template != template or found.slots != dict(slots):
-        raise ArgumentError(f"'{text}' does not mean '{template}' with {dict(slots)} alone; use other words")
+        raise ArgumentError(
+            f"'{text}' is ambiguous: it does not only mean '{template}' with {dict(slots)}; use other words"
+        )
     return text
 
 

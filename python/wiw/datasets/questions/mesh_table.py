@@ -140,7 +140,8 @@ def _read_room(name: str, kind: str, rooms: Sequence[Room]) -> str:
     if len(fit) != 1:
         known = ", ".join(sorted(room.kind for room in rooms)) or "none"
         raise ArgumentError(
-            f"attributes: {name}: room: expected a kind of which the scene has one room, of {known}; got '{kind}'"
+            f"attributes: {name}: room: expected a kind that exactly one room of the scene has, of {known}; got "
+            f"'{kind}'"
         )
     return fit[0]
 

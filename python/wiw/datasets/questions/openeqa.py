@@ -64,7 +64,7 @@ def load(path: str | Path, scenes: str | Path = "", path_lengths: str | Path | N
         other = first.setdefault(episode.episode_id, i)
         if other != i:
             raise FileError(
-                f"{where}: question_id '{episode.episode_id}' is that of item {other}, too; expected its own"
+                f"{where}: question_id '{episode.episode_id}' is also that of item {other}; expected a unique one"
             )
         found.append(episode)
     if not scenes:
@@ -192,6 +192,6 @@ def locate_start(world: World, episode: Episode) -> Episode:
         raise FileError(
             f"episode {episode.episode_id}: start_position {to_position(start)} is not on the navigation mesh of "
             f"{world.name}; the nearest place, {to_position(nearest)}, is {away:.2f} m away, expected at most {NEAR} "
-            "m: is this the scene of the question?"
+            "m: is this the right scene?"
         )
     return replace(episode, start_position=to_position(nearest))

@@ -112,7 +112,7 @@ def measure(
         ArgumentError: there are no windows.
     """
     if not windows:
-        raise ArgumentError("expected scenes in which windows can be drawn, got none; name others")
+        raise ArgumentError("expected scenes from which windows can be sampled, got none; choose others")
     others = shuffle_places(windows, seed)
     for index, window in enumerate(windows):
         trajectories = {"true": window.trajectory}
@@ -151,7 +151,9 @@ def evaluate(
     """
     names = scenes.resolve(specs)
     windows = [
-        window for name in bar(names, f"measuring on {specs}", len(names)) for window in draw_windows(name, count, seed)
+        window
+        for name in bar(names, f"evaluating on {specs}", len(names))
+        for window in draw_windows(name, count, seed)
     ]
     rows = list(measure(windows, {**BASELINES, "pocket": imagine_by(model)}, seed))
     return {

@@ -39,7 +39,7 @@ class SignalledCheckpoint(Checkpoint):
         """
         if len(set(distributed.collect(self.path.exists()))) > 1:
             raise ArgumentError(
-                f"{self.path} is there on some machines only: expected a folder that all share; name one by --out"
+                f"{self.path} exists on some machines only: expected a folder that all share; choose one with --out"
             )
         return super().load()
 

@@ -340,4 +340,4 @@ def list_remedies(recipe: PostTrainingRecipe) -> list[str]:
 
 def _require_free(out: Path) -> None:
     if out.exists() and (not out.is_dir() or any(out.iterdir())):
-        raise ArgumentError(f"{out} holds something already; name a folder that is new or empty")
+        raise ArgumentError(f"{out} is not empty; choose a new or empty folder")

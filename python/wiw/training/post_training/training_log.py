@@ -49,7 +49,7 @@ class TrainingLog:
             whole, newline, _ = self.path.read_text(encoding="utf-8").rpartition("\n")
             return [json.loads(line) for line in whole.splitlines()] if newline else []
         except (OSError, ValueError) as error:
-            raise FileError(f"{self.path}: expected a JSON object a line, got {error}; delete it") from error
+            raise FileError(f"{self.path}: expected one JSON object per line, got {error}; delete it") from error
 
     def write(self, step: int, values: Mapping[str, float]) -> None:
         """Add a line of numbers.

@@ -94,11 +94,11 @@ def find_held_out(
     held_out = open_part(corpus.data.folder, "held-out") if validation is None else open_part(validation, "all")
     if held_out.space != corpus.space:
         raise ArgumentError(
-            f"validation: expected a dataset of `{corpus.command}`, as that of the training is, but "
-            f"{held_out.data.folder} is of `{held_out.command}`"
+            f"validation: expected a dataset of `{corpus.command}`like the training's, but {held_out.data.folder} is "
+            f"from `{held_out.command}`"
         )
     if decisions is not None and corpus.space != PRIMITIVES:
-        raise ArgumentError("decisions: those of `wiw collect decisions` are an agent's that moves; leave them out")
+        raise ArgumentError("decisions: those of `wiw collect decisions` are for a moving agent; leave them out")
     names, trained = held_out.units, corpus.units
     if names & trained:
         raise ArgumentError(
@@ -107,7 +107,7 @@ def find_held_out(
     if not names:
         raise ArgumentError(
             f"validation: no {corpus.unit} of {held_out.data.folder} is held out; collect more {corpus.unit}s, raise "
-            "held_out in the recipe, give another dataset by --validation, or train without (--option "
+            "held_out in the recipe, give another dataset with --validation, or train without validation (--option "
             "validate_every=null)"
         )
     return held_out
@@ -136,7 +136,7 @@ def build_validation_set(
         longest, actions = stored[0].plans.shape[-1], clips.plans.shape[1]
         if longest > actions:
             raise ArgumentError(
-                f"{decisions}: expected plans of at most {actions} actions, those of a clip, got {longest}; collect "
+                f"{decisions}: expected plans of at most {actions} actions, as in a clip, got {longest}; collect "
                 f"others with --actions {actions}"
             )
         identity["decisions"] = digest_decisions(decisions)
