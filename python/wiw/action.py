@@ -198,7 +198,7 @@ def to_controls(
     plan = np.asarray(actions)
     if isinstance(vocabulary, GripperVocabulary):
         if null_first:
-            raise ArgumentError("to_controls: poses are absolute, one a frame; put the current pose in front instead")
+            raise ArgumentError("to_controls: poses are absolute, one per frame; prepend the current pose instead")
         rotation = _rotation(vocabulary.rotation)
         return np.asarray(_core.encode_gripper(_poses(plan), rotation, vocabulary.bounds))
     entries = {_action(key): value for key, value in vocabulary.items()}
@@ -247,7 +247,7 @@ def resample(
     if given.size and not np.issubdtype(given.dtype, np.floating):
         raise ArgumentError(
             f"resample: expected floating-point poses, got {given.dtype} {given.shape}: discrete actions cannot be "
-            "interpolated, use pad() or chunk()"
+            "interpolated; use pad() or chunk()"
         )
     if length < 1:
         raise ArgumentError(f"resample: expected a length of at least 1, got {length}")

@@ -27,7 +27,7 @@ def resolve_device(name: str | None) -> str:
     try:
         asked = torch.device(name)
     except RuntimeError as error:
-        raise ArgumentError(f"device: expected one of torch, such as cpu, cuda or cuda:1, got '{name}'") from error
+        raise ArgumentError(f"device: expected a torch device, such as cpu, cuda or cuda:1, got '{name}'") from error
     if asked.type == "cuda" and not 0 <= (asked.index or 0) < torch.cuda.device_count():
         raise ArgumentError(
             f"device: torch sees {torch.cuda.device_count()} CUDA devices, so there is no '{name}'; check the driver "
@@ -102,13 +102,15 @@ def explain_hub_error(error: BaseException, name: str, revision: str | None) -> 
         return WeightsError(text, "revision")
     if met(errors.RepositoryNotFoundError):
         text = (
-            f"the hub has no repository '{name}', or it is private: check the name, or `hf auth login`; "
-            "weights= also takes a folder"
+            f"the hub has no repository '{name}', or it is private: check the name, or log in with `hf auth login`; "
+            "weights= also accepts a folder"
         )
         return WeightsError(text, "missing")
     unreachable = any(kind.__name__ in NETWORK_ERRORS for link in chain for kind in type(link).__mro__)
     if unreachable or met(errors.OfflineModeIsEnabled, errors.LocalEntryNotFoundError):
-        text = f"'{name}' is not on this machine and the hub is out of reach: connect (unset HF_HUB_OFFLINE), {by_hand}"
+        text = (
+            f"'{name}' is not on this machine and the hub cannot be reached: connect (unset HF_HUB_OFFLINE), {by_hand}"
+        )
         return WeightsError(text, "network")
     return WeightsError(f"'{name}' cannot be downloaded: {error}; try again, {by_hand}")
 

@@ -59,7 +59,7 @@ class Registry:
             RegistryError: the name is taken, or the class is of another kind.
         """
         if name in self.names():
-            raise RegistryError(f"the {self.kind} '{name}' is there already; choose another name")
+            raise RegistryError(f"the {self.kind} '{name}' already exists; choose another name")
         self.registered[name] = self._check_kind(name, thing)
 
     def find(self, name: str) -> Any:
@@ -96,7 +96,7 @@ class Registry:
         if colon:
             return self._load(name, partial(_attribute, name))
         hint = (
-            f" A file defines several things: name one of its classes, as {name}:CLASS."
+            f" To use a file, name one of its classes: {name}:CLASS."
             if name.endswith(".py")
             else did_you_mean(name, self.names())
         )
@@ -149,7 +149,7 @@ class Registry:
                 raise
             name = what if isinstance(what, str) else getattr(what, "__qualname__", repr(what))
             raise ConstructionError(
-                f"{self.kind} '{name}' cannot be made: {type(error).__name__}: {error}{_locate_error(error)}"
+                f"{self.kind} '{name}' cannot be built: {type(error).__name__}: {error}{_locate_error(error)}"
             ) from error
 
     def _list_plugins(self) -> dict[str, Any]:
@@ -174,7 +174,9 @@ class Registry:
         base = getattr(importlib.import_module(module), attribute)
         if issubclass(thing, base) if inspect.isclass(thing) else isinstance(thing, base):
             return thing
-        raise RegistryError(f"'{name}' is no {self.kind}: expected a class derived from wiw.{attribute}, got {thing!r}")
+        raise RegistryError(
+            f"'{name}' is not a {self.kind}: expected a class derived from wiw.{attribute}, got {thing!r}"
+        )
 
 
 def _makes(thing: Any) -> bool:

@@ -55,7 +55,7 @@ def require_known(names: Iterable[Any], known: Collection[str], where: str, noun
     if unknown:
         there = ", ".join(known) or "none"
         hint = did_you_mean(unknown[0], list(known))
-        raise ArgumentError(f"{where}: unknown {noun} '{unknown[0]}'; there are {there}.{hint}")
+        raise ArgumentError(f"{where}: unknown {noun} '{unknown[0]}'; expected one of {there}.{hint}")
 
 
 def _read_value(value: Any, kind: Any, where: str) -> Any:

@@ -277,7 +277,7 @@ def test_checkpoints_that_do_not_fit_are_named(made, world_model_options, tmp_pa
 @pytest.mark.parametrize("name", ["svd-action", "cosmos-predict2-action"])
 def test_a_lora_of_a_pipeline_that_takes_none_is_refused(name: str, made, tmp_path: Path) -> None:
     model = made(name)
-    with pytest.raises(ArgumentError, match="takes no LoRA: write its denoiser whole"):
+    with pytest.raises(ArgumentError, match="does not support LoRA: save its whole denoiser"):
         checkpoint.save(tmp_path / "lora", model.conditioning.encoders, model.generator.pipeline, lora=True)
     folder = shutil.copytree(model.checkpoint, tmp_path / "checkpoint")
     (folder / "pytorch_lora_weights.safetensors").write_bytes(b"of another trainer")

@@ -70,7 +70,7 @@ def test_answers_that_break_the_contract_are_named(answer: Any, reason: str) -> 
     [
         (IMAGES[0], ["a"], "uint8 \\[H, W, 3\\]"),
         (IMAGES.astype(float), ["a"], "float64"),
-        (IMAGES, ["a", "a"], "names that differ"),
+        (IMAGES, ["a", "a"], "distinct, non-empty names"),
         (IMAGES, [" "], "not empty"),
     ],
 )
@@ -112,7 +112,7 @@ def test_the_simulator_fills_boxes() -> None:
     assert second.shape == (0, 20, 30)
     with pytest.raises(ArgumentError, match="left < right"):
         segmenter.segment(IMAGES[:1], [[[20, 0, 5, 9]]], ids=IDS[:1])
-    with pytest.raises(ArgumentError, match="one array of boxes an image"):
+    with pytest.raises(ArgumentError, match="one array of boxes per image"):
         segmenter.segment(IMAGES, boxes[:1], ids=IDS)
 
 

@@ -287,7 +287,7 @@ def test_a_policy_s_new_process_takes_no_memory_for_one_of_the_old_one_s(tmp_pat
     assert [look(first), look(first), look(second)] == ["look 1, 0 done", "look 2, 0 done", "look 1, 0 done"]
     policy.close()
     new = policy.begin(goal, key)
-    with pytest.raises(RaisedError, match="process has ended since"):
+    with pytest.raises(RaisedError, match="process has ended, and its memory"):
         look(second)
     del first, second
     gc.collect()

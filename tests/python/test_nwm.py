@@ -362,7 +362,7 @@ def test_weights_that_do_not_fit_are_named(weights: Path, tmp_path: Path, monkey
         NWM(weights=str(weights), vae=str(partial.parent), device="cpu")
     monkeypatch.setenv("HF_HUB_OFFLINE", "1")
     monkeypatch.setattr("huggingface_hub.constants.HF_HUB_OFFLINE", True)
-    with pytest.raises(WeightsError, match="hub is out of reach"):
+    with pytest.raises(WeightsError, match="hub cannot be reached"):
         NWM(weights="nobody/nothing", vae=vae, device="cpu")
     with pytest.raises(WeightsError, match="no AutoencoderKL in"):
         NWM(weights=str(weights), vae=str(tmp_path / "nowhere"), device="cpu")

@@ -345,7 +345,7 @@ class TestReplica:
     @pytest.mark.parametrize(
         ("text", "message"),
         [
-            ("{", "no table of Replica's"),
+            ("{", "not a Replica table"),
             ('{"classes": [{"id": 1, "name": "a"}], "objects": [{"id": 3, "class_id": 7}]}', "no table .*KeyError: 7"),
             ('{"objects": []}', "no table .*KeyError: 'classes'"),
         ],
@@ -467,7 +467,7 @@ class TestSceneDataset:
         ("change", "message"),
         [
             ({"stage_instance": {}}, "cannot be read as a scene instance .*KeyError: 'template_name'"),
-            ({"object_instances": [{"template_name": "chair", "rotation": [0, 0, 0, 0]}]}, "is no quaternion"),
+            ({"object_instances": [{"template_name": "chair", "rotation": [0, 0, 0, 0]}]}, "is not a quaternion"),
             ({"object_instances": [{"template_name": "chair", "translation": [1, 2]}]}, "three finite numbers"),
             ({"object_instances": 3}, "cannot be read as a scene instance"),
         ],
@@ -518,7 +518,7 @@ def test_verify_says_what_is_wrong(tmp_path: Path, capsys: pytest.CaptureFixture
     damaged.with_name("info_semantic.json").write_text("{")
     assert main(["scenes", "verify", str(tmp_path / "all")]) == 1
     out = capsys.readouterr().out
-    assert "3 scans, 2 with something wrong" in out and "info_semantic.json: no table of Replica's" in out
+    assert "3 scans, 2 with something wrong" in out and "info_semantic.json: not a Replica table" in out
     assert "1 of 6 objects lie over 0.5 m from their boxes in the house file: 2" in out
     row = next(line.split() for line in out.splitlines() if line.startswith("whole"))
     assert row[2:7] == ["2", "0.0", "6", "6", "2"]

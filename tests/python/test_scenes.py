@@ -442,7 +442,7 @@ def test_a_scene_that_cannot_be_kept_is_used_all_the_same(
 
     monkeypatch.setattr(_core.scene, "write_cache", full)
     assert scenes.store.load_generated(["full"], flat).triangle_count == 2
-    assert "disk full" in caplog.text and "made again the next time" in caplog.text
+    assert "disk full" in caplog.text and "generated again next time" in caplog.text
     monkeypatch.undo()
     (tmp_path / "file").write_text("no folder")
     monkeypatch.setenv("WIW_CACHE", str(tmp_path / "file"))

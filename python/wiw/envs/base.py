@@ -95,19 +95,19 @@ class Env(ABC):
 
     def fork(self) -> Any:
         """Return a copy of the simulator in its present state, which the world model `oracle` simulates ahead."""
-        raise self._lacks("has no simulator to copy, which world model 'oracle' runs ahead", "fork")
+        raise self._lacks("has no simulator to copy, which world model 'oracle' needs", "fork")
 
     def guide(self) -> Guide:
         """Return the ground truth about plans from here, which `wiw blame` gives to stages of the loop."""
-        raise self._lacks("does not tell what plans are truly worth, which `wiw blame` asks", "guide")
+        raise self._lacks("does not provide the true value of plans, which `wiw blame` needs", "guide")
 
     def semantic(self) -> NDArray[np.uint32]:
         """Return the true category of each pixel of the panorama, uint32 [H, W], for `--semantics simulator`."""
-        raise self._lacks("has no true semantics, which `--semantics simulator` asks for", "semantic")
+        raise self._lacks("has no true semantics, which `--semantics simulator` needs", "semantic")
 
     def instances(self) -> tuple[NDArray[np.uint32], Sequence[Mapping[str, Any]]]:
         """Return the true instance of each pixel of the panorama, uint32 [H, W], and the scene's table of them."""
-        raise self._lacks("does not tell which instance each pixel shows", "instances")
+        raise self._lacks("does not provide the instance that each pixel shows", "instances")
 
     def close(self) -> None:
         """Release the resources of the environment."""
@@ -115,7 +115,7 @@ class Env(ABC):
 
     def _lacks(self, what: str, method: str) -> ArgumentError:
         name = type(self).__name__
-        return ArgumentError(f"{name} {what}; use something else, or write `{name}.{method}`")
+        return ArgumentError(f"{name} {what}; use something else, or implement `{name}.{method}`")
 
 
 def read_episode_option(options: Mapping[str, Any] | None) -> Any:
@@ -126,5 +126,5 @@ def read_episode_option(options: Mapping[str, Any] | None) -> Any:
     """
     given = options or {}
     if unknown := [str(name) for name in given if name != "episode"]:
-        raise ArgumentError(f"reset: unknown option '{unknown[0]}'; the only one is 'episode', its number")
+        raise ArgumentError(f"reset: unknown option '{unknown[0]}'; the only option is 'episode', the episode's number")
     return given.get("episode")

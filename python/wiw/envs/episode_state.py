@@ -221,7 +221,7 @@ def wrap_episode(task: NavigationSpec, index: int) -> int:
         ArgumentError: a negative number.
     """
     if index < 0:
-        raise ArgumentError(f"expected an episode's number of at least 0, got {index}")
+        raise ArgumentError(f"expected an episode number of at least 0, got {index}")
     return index % task.episode_count if task.episode_count else index
 
 

@@ -119,7 +119,9 @@ class NavigationEnv(gymnasium.Env[dict[str, Any], int], Env):
         """
         self.state.decisions += 1
         if answer is None and self.goal.expects_answer:
-            raise ArgumentError("run: the goal expects an answer; give the decision's too, run(plan, answer)")
+            raise ArgumentError(
+                "run: the goal expects an answer; pass the decision's answer as well, run(plan, answer)"
+            )
         stays = answer is not None and self.state.record_answer(self.task, answer)
         return self._carry_out([] if stays else self.state.limit_plan(self.task, plan))
 

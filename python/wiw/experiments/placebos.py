@@ -129,11 +129,11 @@ def require_words(control: str) -> None:
     if control != "text":
         raise ArgumentError(
             "placebo-blind asks a world model with an empty prompt: expected one with control 'text', got "
-            f"'{control}'; placebo-shuffled and placebo-swapped take any"
+            f"'{control}'; placebo-shuffled and placebo-swapped work with any"
         )
 
 
-NO_POSES = "placebo='shuffled' deals primitives anew, and these plans are made of none; use 'swapped'"
+NO_POSES = "placebo='shuffled' reshuffles primitives, but these plans contain none; use 'swapped'"
 
 
 def shuffle(plans: Sequence[Proposal], key: Key, spec: planner.ModelSpec) -> list[Proposal]:

@@ -96,19 +96,19 @@ def _paint_colors(instances: Sequence[Mapping[str, Any]]) -> NDArray[np.uint8]:
 
 
 class OracleExplorer(PrivilegedExplorer):
-    """Explores for itself with true labels."""
+    """Explores like `Explorer`, but with true labels."""
 
     true_labels = True
 
 
 class TourExplorer(PrivilegedExplorer):
-    """Is led through the whole home, and labels it as `Explorer` does."""
+    """Gets a tour of the whole home, and labels it like `Explorer`."""
 
     tour = True
 
 
 class OracleTourExplorer(PrivilegedExplorer):
-    """Is led through the whole home with true labels: what it gets wrong is the map's or the answerer's error."""
+    """Gets a tour of the whole home with true labels: what it gets wrong is an error of the map or the answering."""
 
     true_labels = tour = True
 

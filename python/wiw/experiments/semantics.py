@@ -32,7 +32,9 @@ def find_source(semantics: Any) -> Semantics | str:
         return SIMULATOR
     source: Semantics = SEMANTICS.make(semantics)
     if "ids" in source.needs:
-        raise ArgumentError(f"Agent: {type(source).__name__} knows one scene; give semantics='simulator' for any")
+        raise ArgumentError(
+            f"Agent: {type(source).__name__} knows only one scene; give semantics='simulator' for any scene"
+        )
     return source
 
 

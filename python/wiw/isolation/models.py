@@ -100,8 +100,8 @@ class IsolatedModel(Isolated, WorldModel):
         self._accepts = parse_declaration(self._begin())
         if "simulator" in self._accepts.needs:
             raise ArgumentError(
-                f"world model '{self.source.name}' needs the simulator, which only the oracle is handed; to study a "
-                "privileged model of your own, give it isolate=false"
+                f"world model '{self.source.name}' needs the simulator, which only the oracle is given; to study your "
+                "own privileged model, give it isolate=false"
             )
 
     def __reduce__(self) -> Any:

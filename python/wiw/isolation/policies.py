@@ -316,7 +316,7 @@ def list_exchanges(host: Host, key: Key) -> str:
 def _show_memories(host: Host, situations: Sequence[Situation]) -> list[Situation]:
     missing = [each.memory for each in situations if each.memory not in host.memories]
     if missing:
-        raise RuntimeError("the policy's process has ended since, and with it the memory of this episode")
+        raise RuntimeError("the policy's process has ended, and its memory of this episode is lost")
     return [replace(each, memory=host.memories[each.memory]) for each in situations]
 
 

@@ -75,7 +75,7 @@ class Source:
             raise RegistryError(f"{self.kind} '{self.name}' cannot be loaded: {error}") from None
         first = getattr(self, "told", told)
         if (told["module"], told["name"]) != (first["module"], first["name"]):  # the module's name has the file's state
-            raise InfrastructureError(f"{self.kind} '{self.name}' has changed since it was loaded; begin a new run")
+            raise InfrastructureError(f"{self.kind} '{self.name}' has changed since it was loaded; start a new run")
         return told
 
 
@@ -133,13 +133,13 @@ class Isolated:
         self._spent_before += self._spent
         self._spent = Counter()
         process = self.source.take_process(self._memory_gb)
-        cannot = f"{self.source.kind} '{self.source.name}' cannot be made"
+        cannot = f"{self.source.kind} '{self.source.name}' cannot be built"
         try:
             told = process.call(function, *arguments, seconds=seconds)[0]
         except LateError as error:
             raise ConstructionError(
-                f"{cannot}: its constructor did not return within {seconds:g} s (deadline). Does it wait for a "
-                "download, a lock, a server or a prompt? If it is only slow, give a longer deadline",
+                f"{cannot}: its constructor did not return within {seconds:g} s (deadline). Is it waiting for a "
+                "download, a lock, a server or a prompt? If it is just slow, give a longer deadline",
                 "deadline",
             ) from error
         except (EndedError, ExitError) as error:

@@ -64,7 +64,8 @@ class AgentSpec:
             reviser = POLICIES.make(policy.default_revision, **space_option(POLICIES, policy.default_revision, space))
         else:
             raise ArgumentError(
-                f"Agent: policy {type(policy.unwrapped).__name__} only proposes; give `reviser=` a policy that scores"
+                f"Agent: policy {type(policy.unwrapped).__name__} only proposes; give a policy that scores as "
+                "`reviser=`"
             )
         if reviser.space != space:
             raise ArgumentError(
@@ -86,8 +87,8 @@ def _make_policy(policy: Any, space: str) -> Policy:
     made: Policy = POLICIES.make(policy, **space_option(POLICIES, policy, space))
     if made.space != space:
         raise ArgumentError(
-            f"Agent: expected plans in {plan_space(space).words}, but policy {type(made.unwrapped).__name__} "
-            f"makes them of {plan_space(made.space).words}"
+            f"Agent: expected plans in {plan_space(space).words}, but policy {type(made.unwrapped).__name__} makes "
+            f"plans of {plan_space(made.space).words}"
         )
     return made
 

@@ -168,8 +168,8 @@ def make_model(what: Any, deadline: float = DEADLINE, **options: Any) -> WorldMo
     except LateError as error:
         name = what if isinstance(what, str) else getattr(what, "__qualname__", repr(what))
         raise ConstructionError(
-            f"world model '{name}' cannot be made: its constructor did not return within {deadline:g} s (deadline). "
-            "Does it wait for a download, a lock, a server or a prompt? If it is only slow, give a longer deadline",
+            f"world model '{name}' cannot be built: its constructor did not return within {deadline:g} s (deadline). "
+            "Is it waiting for a download, a lock, a server or a prompt? If it is just slow, give a longer deadline",
             "deadline",
         ) from error
     return made
@@ -183,7 +183,7 @@ def _catch_exit(work: Callable[[], Any]) -> Any:
         if isinstance(error, Exception) or is_stop_request(error):
             raise
         raise ExitError(
-            f"{error!r}, as if to end the process; a model that cannot answer raises an Exception"
+            f"{error!r}, as if to end the process; a model that cannot answer should raise an Exception"
         ) from error
 
 

@@ -21,7 +21,7 @@ from wiw.types import Conditioning, Control, Key, Observation, Rollout, View
 from wiw.world_models.base import Accepts, WorldModel, ask
 
 NO_SEMANTICS = (
-    "needs semantics: choose a source of them, --semantics simulator or --semantics rednet "
+    "needs semantics: choose a source with --semantics simulator or --semantics rednet "
     "(wiw.experiments.semantics.Labelled); see docs/perception.md"
 )
 
@@ -170,8 +170,8 @@ def _require_own_memory(found: NDArray[np.uint8], before: Sequence[NDArray[np.ui
     """Return the answer, if it lies elsewhere than those of earlier calls, which are still to be read."""
     if any(np.may_share_memory(found, answer) for answer in before):
         raise ContractError(
-            f"{type(model.unwrapped).__name__}.rollout: gave the memory of an earlier answer, whose frames are lost by "
-            "that; return a new array from every call",
+            f"{type(model.unwrapped).__name__}.rollout: returned the memory of an earlier answer, whose frames are "
+            "overwritten by that; return a new array from every call",
             "memory",
         )
     return found
@@ -221,7 +221,7 @@ def list_depths(inputs: Sequence[ModelInput]) -> list[NDArray[np.float32]]:
     """
     depths = [own.observation.depth for own in inputs]
     if any(value is None for value in depths):
-        raise ArgumentError("the world model needs depth: make the environment with depth=True")
+        raise ArgumentError("the world model needs depth: create the environment with depth=True")
     return depths
 
 

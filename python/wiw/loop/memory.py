@@ -41,7 +41,7 @@ def read_observation(observation: Any) -> Observation | ArmObservation:
     if not isinstance(observation, dict):
         return observation
     if "pose" in observation:
-        raise ArgumentError("decide: this dict does not say where things are; pass env.unwrapped.observation")
+        raise ArgumentError("decide: this dict lacks the poses that an agent needs; pass env.unwrapped.observation")
     if "panorama_box" in observation:
         raise ArgumentError("decide: these images have the target's box drawn on them; pass env.observation")
     return Observation(**observation)

@@ -38,7 +38,7 @@ class LiveEnvironments:
         env = self._by_episode.get((key.seed, key.episode))
         if env is None:
             raise ArgumentError(
-                "this agent has parts that need the simulator (the oracle, ground truth, fidelity): run it by "
+                "this agent has parts that need the simulator (the oracle, ground truth, fidelity): run it with "
                 "wiw.evaluate, or pass the environment's fork: decide(..., simulator=env.fork())"
             )
         return env

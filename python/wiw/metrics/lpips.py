@@ -134,10 +134,10 @@ def _read(folder: Path, device: str) -> tuple[str, dict[str, Any]]:
     absent = [file.name for file in (BACKBONE, HEADS) if not (folder / file.name).is_file()]
     if absent:
         raise WeightsError(
-            f"LPIPS: {' and '.join(absent)} not found in {folder}. It needs two published files there, "
-            f"{BACKBONE.name} ({BACKBONE.size}) and {HEADS.name} ({HEADS.size}, also in the lpips package as "
-            f"lpips/weights/v0.1/{HEADS.name}):\n"
-            f"  curl -L --create-dirs --output-dir {folder} -O {BACKBONE.url} -O {HEADS.url}"
+            f"LPIPS: {' and '.join(absent)} not found in {folder}. It needs two published files there, {BACKBONE.name} "
+            f"({BACKBONE.size}) and {HEADS.name} ({HEADS.size}, also in the lpips package as "
+            f"lpips/weights/v0.1/{HEADS.name}):\n  curl -L --create-dirs --output-dir {folder} -O {BACKBONE.url} -O "
+            f"{HEADS.url}"
         )
     for file in (BACKBONE, HEADS):
         _require_published(folder / file.name, file)

@@ -74,8 +74,8 @@ SUCCESS = Metric("success", "SR", "rate", True, about="Success rate: percent of 
 SPL = Metric("spl", "SPL", "rate", True, about="Success weighted by path length, in percent.")
 SPL_RULE = (
     "SPL: the mean of success * l / max(l, p), as in the paper; p is the path walked, l the shortest path to the goal "
-    "point itself (in primitives instead of metres where the rules say so). Success asks only for its radius, so a "
-    "detour of about that length costs nothing."
+    "point itself (in primitives instead of metres where the rules say so). Success only requires coming within its "
+    "radius, so a detour of about that length costs nothing."
 )
 """The formula where paths lead to a goal point."""
 ANSWER_SCORE = Metric(
@@ -87,7 +87,7 @@ GROUNDED = Metric(
     "Grounded",
     "rate",
     True,
-    about="Percent of episodes in which what is asked about was in sight.",
+    about="Percent of episodes in which the object of the question was in sight.",
     partial=True,
 )
 PATH_LENGTH = Metric(

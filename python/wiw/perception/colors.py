@@ -87,7 +87,7 @@ class ColorNamer:
             return cls(categories, **{name: np.array(value, np.float64) for name, value in values.items()})
         except (OSError, ValueError, KeyError, TypeError, AttributeError, ArgumentError) as error:
             raise WeightsError(
-                f"{path}: expected parameters of colour naming: {error}; `wiw train perception` makes some",
+                f"{path}: expected parameters for colour naming: {error}; `wiw train perception` creates them",
                 "missing" if isinstance(error, OSError) else "unfit",
             ) from error
 

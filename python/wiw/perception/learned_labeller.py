@@ -155,6 +155,6 @@ def require_torch() -> None:
         import torch  # noqa: F401
     except ImportError as error:
         raise DependencyError(
-            f"the learned labeller needs torch and safetensors ({error}): pip install 'wiw[torch]', or for a CPU alone "
+            f"the learned labeller needs torch and safetensors ({error}): pip install 'wiw[torch]', or for CPU only "
             "pip install torch safetensors --extra-index-url https://download.pytorch.org/whl/cpu"
         ) from error

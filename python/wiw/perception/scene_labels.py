@@ -116,7 +116,7 @@ class Labeller(ABC):
             provided = None if ids is None else f"{ids.dtype} {ids.shape}"
             raise ArgumentError(
                 f"label: {type(self).__name__} reads the simulator's instance ids; expected ids uint32 "
-                f"{images.shape[:3]}, got {provided}; imagined views have none, so label these with another labeller"
+                f"{images.shape[:3]}, got {provided}; imagined views have none, so use another labeller for these"
             )
         return ids
 

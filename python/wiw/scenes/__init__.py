@@ -139,7 +139,7 @@ def apartment(seed: int, split: str = "val", cache: bool = True, *, edits: Seque
     def make() -> Scene:
         started = time.perf_counter()
         scene = _core.scene.apartment(seed, split, edits)
-        _log.info("%s made in %.1f s", scene.name, time.perf_counter() - started)
+        _log.info("%s built in %.1f s", scene.name, time.perf_counter() - started)
         return scene
 
     identity: list[str | int] = ["apartment", store.build_digest(), split, int(seed), *edits]
@@ -284,8 +284,8 @@ def open_scene(name: str) -> Scene:
         cause = next((warning for warning in scene.warnings if "texture" in warning or "image" in warning), "")
         raise FileError(
             f"{name}: {scene.missing_texture_share:.0%} of its surface lacks its texture and would be drawn grey "
-            f"({cause}); at most {MOST_MISSING:.0%} may. Put the textures where the file names them, or allow it with "
-            f"--allow-missing-textures ({ALLOW_VARIABLE}=1)"
+            f"({cause}); at most {MOST_MISSING:.0%} is allowed. Put the textures where the file expects them, or allow "
+            f"it with --allow-missing-textures ({ALLOW_VARIABLE}=1)"
         )
     return scene
 

@@ -65,8 +65,8 @@ def import_scan(file: Path, allow_missing: bool, **options: Any) -> tuple[_core.
     imported = _import_with(note_need, file, options)
     if needed:
         raise DependencyError(
-            f"{file}: its textures are in Basis Universal, which needs opengl_basisu: pip install 'wiw[hm3d]' (or "
-            "--allow-missing-textures draws the scan grey)"
+            f"{file}: its textures are in Basis Universal, which needs opengl_basisu: pip install 'wiw[hm3d]' (or give "
+            "--allow-missing-textures to draw the scan grey)"
         )
     return imported
 

@@ -87,4 +87,4 @@ def _reply(path: str, child: subprocess.CompletedProcess[bytes]) -> dict[str, An
 
 
 def _out_of_time(path: str) -> FileError:
-    return FileError(f"{path}: importing took more than {TIMEOUT:.0f} s and was given up (damaged file?)")
+    return FileError(f"{path}: importing took more than {TIMEOUT:.0f} s and was aborted (damaged file?)")

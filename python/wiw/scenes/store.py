@@ -64,7 +64,7 @@ def load_imported(source: Path, options: dict[str, Any], build: Callable[[Path],
         folder().mkdir(parents=True, exist_ok=True)
         draft.touch()
     except OSError as error:
-        _log.warning("an imported scene is not kept and will be imported again the next time: %s", error)
+        _log.warning("an imported scene cannot be cached and will be imported again next time: %s", error)
         return temporary(build)
     started = time.time_ns()
     try:
@@ -130,7 +130,7 @@ def _keep_scene(scene: _core.scene.Scene, path: Path) -> _core.scene.Scene:
         _trim(path)
         return _core.scene.map_cache(path)
     except (FileError, OSError) as error:
-        _log.warning("a generated scene is not kept and will be made again the next time: %s", error)
+        _log.warning("a generated scene cannot be cached and will be generated again next time: %s", error)
         return scene
 
 
@@ -169,7 +169,7 @@ def _map_scene(path: Path) -> _core.scene.Scene | None:
     try:
         scene = _core.scene.map_cache(path)
     except FileError as error:
-        _log.warning("built again: %s", error)
+        _log.warning("rebuilt: %s", error)
         return None
     with suppress(OSError):
         os.utime(path)
@@ -237,7 +237,7 @@ def _find_known(manifest: Path) -> _core.scene.Scene | None:
     except FileNotFoundError:
         return None
     except (OSError, ValueError, KeyError, TypeError) as error:
-        _log.warning("the scene cache is built again: %s", error)
+        _log.warning("the scene cache is rebuilt: %s", error)
         return None
 
 

@@ -103,9 +103,9 @@ class LaionScorer:
 def _require_head(path: Path) -> Path:
     if not path.is_file():
         raise WeightsError(
-            f"LAION's aesthetic predictor: no {HEAD} in {path.parent}. It is a published file of 3.7 MB:\n"
-            f"  curl -L --create-dirs -o '{path}' '{HEAD_URL}'\n"
-            f"CLIP ViT-L/14 comes from the folder {path.parent / CLIP}, or from openai/{CLIP} on the Hugging Face hub"
+            f"LAION's aesthetic predictor: no {HEAD} in {path.parent}. Download the published file (3.7 MB) with:\n  "
+            f"curl -L --create-dirs -o '{path}' '{HEAD_URL}'\nCLIP ViT-L/14 comes from the folder "
+            f"{path.parent / CLIP}, or from openai/{CLIP} on the Hugging Face hub"
         )
     return path
 

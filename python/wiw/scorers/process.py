@@ -132,7 +132,7 @@ class ProcessScorer:
         if not isinstance(path, str) or not isinstance(scores, dict):
             self._fail("malformed", f"{expected}, got {_quote(line)}")
         if path not in asked:
-            self._fail("unknown", f"it scored {_quote(path)}, which it was not asked about; repeat paths as given")
+            self._fail("unknown", f"it scored {_quote(path)}, which was not requested; repeat paths exactly as given")
         if path in answered:
             self._fail("repeated", f"it scored {path} twice; answer each path once")
         if set(scores) != set(self.card.scores):
@@ -162,8 +162,8 @@ class ProcessScorer:
         except queue.Empty:
             self._fail(
                 "hung",
-                f"no line for {self._deadline:g} s, with {answered} of {asked} images answered; flush "
-                "each line, or allow more seconds with deadline= or --deadline",
+                f"no line for {self._deadline:g} s, with {answered} of {asked} images answered; flush each line, or "
+                "allow more time with deadline= or --deadline",
             )
         if not raw:
             self._explain_end(answered, asked)
@@ -176,8 +176,8 @@ class ProcessScorer:
         if not isinstance(line, dict):
             self._fail(
                 "malformed",
-                f"{expected}, got {_quote(raw.decode(errors='replace').strip())}; anything else "
-                "belongs on the standard error",
+                f"{expected}, got {_quote(raw.decode(errors='replace').strip())}; print anything else to standard "
+                "error",
             )
         return line
 
@@ -186,12 +186,12 @@ class ProcessScorer:
         try:
             code = self._process.wait(self._deadline)
         except subprocess.TimeoutExpired:
-            self._fail("hung", f"it closed its output with {answered} of {asked} images answered, and does not end")
+            self._fail("hung", f"it closed its output with {answered} of {asked} images answered, but keeps running")
         if code != 0:
             how = f"by signal {-code}" if code < 0 else f"with exit code {code}"
             self._fail("crashed", f"it ended {how} with {answered} of {asked} images answered")
         if asked == 0:
-            self._fail("card", "it ended without saying who it is; see `wiw quality --help`")
+            self._fail("card", "it ended without identifying itself; see `wiw quality --help`")
         self._fail("partial", f"it ended with {answered} of {asked} images answered; expected an answer for each path")
 
     def _wait(self) -> None:
@@ -201,9 +201,9 @@ class ProcessScorer:
             extra = self._lines.get(timeout=self._deadline)
             code = self._process.wait(self._deadline)
         except (queue.Empty, subprocess.TimeoutExpired):
-            self._fail("hung", f"{count}, but it does not end when its input does")
+            self._fail("hung", f"{count}, but it keeps running after the end of its input")
         if extra:
-            self._fail("repeated", f"{count}, but it goes on with {_quote(extra.decode(errors='replace').strip())}")
+            self._fail("repeated", f"{count}, but it continues with {_quote(extra.decode(errors='replace').strip())}")
         if code != 0:
             self._fail("crashed", f"{count}, but it ended with exit code {code}")
 

@@ -53,8 +53,8 @@ class VlmServer:
     def __init__(self, client: Client, port: int = 0, host: str = "127.0.0.1", token: str | None = None) -> None:
         if token is None and not is_loopback(host):
             raise ArgumentError(
-                f"serve-vlm: {host} can be reached by others than this machine: set WIW_TOKEN (or --token) to a secret "
-                "that clients send as OPENAI_API_KEY, such as the output of `openssl rand -hex 16`"
+                f"serve-vlm: {host} can be reached from other machines: set WIW_TOKEN (or --token) to a secret that "
+                "clients send as OPENAI_API_KEY, such as the output of `openssl rand -hex 16`"
             )
         self.client, self.token = client, token
         self.requests: list[dict[str, Any]] = []
@@ -144,7 +144,7 @@ class _Handler(BaseHTTPRequestHandler):
         server: VlmServer = self.server.server  # type: ignore[attr-defined]
         if self.headers.get("origin"):  # a browser names the page that asks; no page has business here
             self.close_connection = True
-            self._send(403, _error("web pages are not answered"))
+            self._send(403, _error("requests from web pages are refused"))
             return
         if not self._is_welcome(server.token):
             return
@@ -171,7 +171,7 @@ class _Handler(BaseHTTPRequestHandler):
         if token is None or hmac.compare_digest(shown, f"Bearer {token}".encode()):
             return True
         self.close_connection = True
-        self._send(401, _error("the server's token is expected as API key"))
+        self._send(401, _error("expected the server's token as API key"))
         return False
 
     def _send(self, status: int, body: Mapping[str, Any], headers: Mapping[str, str] | None = None) -> None:

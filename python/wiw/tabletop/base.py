@@ -153,7 +153,7 @@ def scatter_places(key: int, count: int, apart: float, tries: int = 1000) -> NDA
             found.append(place)
         if len(found) == count:
             return np.stack(found)
-    raise ArgumentError(f"scatter_places: expected room for {count} things {apart} m apart, there is for {len(found)}")
+    raise ArgumentError(f"scatter_places: expected room for {count} things {apart} m apart, got room for {len(found)}")
 
 
 def choose_names(key: int, names: Sequence[str], count: int) -> list[str]:

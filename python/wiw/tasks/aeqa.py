@@ -95,8 +95,8 @@ class AEQA(NavigationTask):
         self.attributes = NO_ATTRIBUTES if attributes is None else read_attributes(attributes)
         if attributes is not None and (self.episode_file or self.is_balanced):
             raise ArgumentError(
-                "aeqa: attributes=FILE says more of a scene that tells little, such as a house of meshes (scenes=...); "
-                "apartments tell everything, and episodes of a file are asked as they are"
+                "aeqa: attributes=FILE describes the objects of a scene that lacks such data, such as a house of "
+                "meshes (scenes=...); apartments need none, and episodes from a file are used as they are"
             )
 
     # -- what it says of itself ----------------------------------------------------------------------------------------
@@ -289,7 +289,7 @@ class AEQA(NavigationTask):
             record.require_whole()
         except (KeyError, TypeError) as error:
             place = f"outcome of {outcome['arm']} in episode {outcome['episode']}"
-            raise StoreError(f"{place}: no {error}; the run store was edited: bring back a copy of it") from error
+            raise StoreError(f"{place}: no {error}; the run store was edited: restore it from a backup") from error
         return record
 
     def _make_record(self, state: EpisodeState) -> AnswerRecord:

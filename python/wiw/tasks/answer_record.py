@@ -150,8 +150,8 @@ def _read_judgement(info: Mapping[str, Any]) -> Judgement | None:
         return Judgement.from_info(info) if info else None
     except (TypeError, ArgumentError) as error:
         raise StoreError(
-            f"expected a judgement with a mark, got {dict(info)!r:.120} ({error}); the run store was edited: bring "
-            "back a copy of it"
+            f"expected a judgement with a mark, got {dict(info)!r:.120} ({error}); the run store was edited: restore "
+            "it from a backup"
         ) from error
 
 

@@ -52,7 +52,7 @@ class ARRules:
 
 
 class AR(NavigationTask):
-    """Say what the boxed thing is, moving where that helps; the policy has to answer.
+    """Recognise the boxed object, moving if that helps; the policy must give an answer.
 
     What is to be recognised, when an episode ends, and what is measured. `NavigationTask` documents the rest of the
     arguments.

@@ -130,7 +130,7 @@ class Task(ABC):
             ArgumentError: a negative number, or there are fewer.
         """
         if index < 0:
-            raise ArgumentError(f"expected an episode's number of at least 0, got {index}")
+            raise ArgumentError(f"expected an episode number of at least 0, got {index}")
         return self.episodes(index + 1)[index]
 
     def vector_environment(self, num_envs: int, depth: bool = False) -> gymnasium.vector.VectorEnv[Any, Any, Any]:

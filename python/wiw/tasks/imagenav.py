@@ -154,7 +154,7 @@ def read_goal_image(path: Path) -> NDArray[np.uint8]:
     """
     found = cv2.imread(str(path), cv2.IMREAD_COLOR)
     if found is None:
-        raise FileError(f"{path}: expected the picture of a goal, got none that can be read")
+        raise FileError(f"{path}: expected a goal image, got a file that cannot be read")
     height, width = found.shape[:2]
     if not 1.5 <= width / height <= 2.5:  # those of the loop have 576 x 1024 pixels
         raise FileError(f"{path}: expected a panorama, about twice as wide as high, got {height}x{width}")

@@ -52,7 +52,7 @@ class ManipulationRules:
 
 
 class Manipulation(ManipulationSpec, Task):
-    """Push buttons, slide a block, put a ring on a peg, stack cups; instructions in words, actions by gripper poses.
+    """Push buttons, slide a block, put a ring on a peg, stack cups; instructions in words, actions as gripper poses.
 
     Args:
         tasks: "all", or names of `TABLETOP_TASKS`; episodes take them in turn.
@@ -83,11 +83,11 @@ class Manipulation(ManipulationSpec, Task):
         **rules: Any,
     ) -> None:
         if robot_tcp and robot is None:
-            raise ArgumentError(f"robot_tcp: names a link of the file `robot`, which is not given; got '{robot_tcp}'")
+            raise ArgumentError(f"robot_tcp: names a link of `robot`, but no robot file is given; got '{robot_tcp}'")
         if walking := [name for name in rules if name in WALKING]:
             raise ArgumentError(
-                f"manipulation: {', '.join(walking)}: this is for tasks in which an agent walks; "
-                "tables are set by `tasks` and `seed`"
+                f"manipulation: {', '.join(walking)}: only for tasks in which an agent walks; tables are determined by "
+                "`tasks` and `seed`"
             )
         self.tasks, self.seed, self.backend = _parse_tasks(tasks), check_seed(seed), backend
         self.robot = load_panda() if robot is None else load_robot(robot, robot_tcp)

@@ -162,7 +162,7 @@ def _find(task: str, preset: str | Path) -> Path | None:
         return path.resolve()
     if not shipped and preset == DEFAULT:
         return None
-    there = f"there are {', '.join(shipped)}, or give" if shipped else "it ships none; give"
+    there = f"choose from {', '.join(shipped)}, or give" if shipped else "it has none of its own; give"
     raise ArgumentError(
         f"{task}: no preset '{preset}'; {there} the path of a .yaml file.{did_you_mean(str(preset), shipped)}"
     )
@@ -186,7 +186,7 @@ def _read_policy(content: Mapping[str, Any], path: Path) -> str | None:
 def _read_generator_rules(content: Mapping[str, Any], path: Path) -> Mapping[str, Any]:
     rules = content.get("generator", {})
     if not isinstance(rules, Mapping):
-        raise ArgumentError(f"{path}: generator: expected rules of generated episodes, `name: value`, got {rules!r}")
+        raise ArgumentError(f"{path}: generator: expected rules for generated episodes as `name: value`, got {rules!r}")
     return {str(name): value for name, value in rules.items()}
 
 
@@ -214,7 +214,7 @@ def _read_departures(content: Mapping[str, Any], path: Path) -> Options:
     )
     if not fits:
         raise ArgumentError(
-            f"{path}: departures: expected reasons by whom they concern ({', '.join(CONCERNS)}), such as "
+            f"{path}: departures: expected reasons, grouped by whom they concern ({', '.join(CONCERNS)}), such as "
             f"`rules: {{decisions: why}}`, got {reasons!r}"
         )
     return dict(reasons)

@@ -72,7 +72,7 @@ class ReplyCache:
         except (sqlite3.Error, OSError) as error:
             self._give_up(error)
         except (ValueError, KeyError, TypeError) as error:
-            _log.warning("kept answer %s is damaged (%s); it is asked for anew", name, error)
+            _log.warning("cached answer %s is damaged (%s); it is requested again", name, error)
         return None
 
     def put(self, answers: Mapping[str, Completion]) -> None:
@@ -111,4 +111,4 @@ class ReplyCache:
 
     def _give_up(self, error: Exception) -> None:
         self._broken = True
-        _log.warning("answers are no longer cached: %s; free disk space or name another folder", error)
+        _log.warning("answers are no longer cached: %s; free some disk space or choose another folder", error)

@@ -58,7 +58,7 @@ class Request:
 
     def __post_init__(self) -> None:
         if self.choices and self.schema is not None:
-            raise ArgumentError("vlm: a request has choices or a schema, not both")
+            raise ArgumentError("vlm: a request takes choices or a schema, not both")
         if len(self.choices) == 1 or len(set(self.choices)) != len(self.choices):
             raise ArgumentError(f"vlm: expected at least two different choices, got {self.choices}")
         if self.tries < 1:

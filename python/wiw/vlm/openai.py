@@ -28,10 +28,12 @@ MOST_OF_AN_ERROR = 1 << 16
 """Bytes of an error's body that are read."""
 LONGEST_WAIT = 60.0
 """Seconds that are waited before a request is sent again, however long the server asks for."""
-REFUSED_LOGPROBS = "; top_logprobs= says how many first tokens the server lists, 0 has choices voted on instead"
+REFUSED_LOGPROBS = (
+    "; set top_logprobs= to the number of first tokens that the server lists, or to 0 to vote on choices instead"
+)
 NOBODY_THERE = (
-    ": no server answers there; start one (docs/vlm.md), name another with --vlm URL, or give --vlm mock to go through "
-    "the motions without a model"
+    ": no server answers there; start one (docs/vlm.md), give another with --vlm URL, or use --vlm mock for a dry run "
+    "without a model"
 )
 _PASSING = (408, 409, 425, 429)
 """Client errors that may pass; so may all of the server's, 500 and above."""
@@ -100,7 +102,7 @@ class OpenAIClient(Client):
             names = [str(each.id) for each in self._ask_with_retries(lambda: list(self._sdk.models.list()))]
             if len(names) != 1:
                 raise VlmError(
-                    f"{self.base_url} offers {', '.join(names) or 'no models'}; name one as model=", "refused"
+                    f"{self.base_url} offers {', '.join(names) or 'no models'}; choose one with model=", "refused"
                 )
             self._model = names[0]
         return self._model
@@ -134,7 +136,7 @@ class OpenAIClient(Client):
         try:
             import openai
         except ImportError:
-            raise DependencyError("asking OpenAI-compatible servers needs openai: pip install 'wiw[vlm]'") from None
+            raise DependencyError("OpenAI-compatible servers need openai: pip install 'wiw[vlm]'") from None
         import os
 
         key = self._key or os.environ.get("OPENAI_API_KEY") or "none"

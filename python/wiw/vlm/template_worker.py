@@ -60,7 +60,7 @@ def fill_template(source: str, slots: Mapping[str, Any]) -> str:
         parts.append(part)
         size += len(part)
         if size > CHARACTERS:
-            raise ValueError(f"expected a prompt of at most {CHARACTERS} characters, and this one has more")
+            raise ValueError(f"expected a prompt of at most {CHARACTERS} characters, but this one has more")
     return "".join(parts)
 
 

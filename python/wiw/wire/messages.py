@@ -121,8 +121,8 @@ def decode(data: Any) -> Message:
     version, name = values.pop("v", None), values.pop("type", None)
     if version != VERSION or type(version) is not int:
         raise RemoteError(
-            f"this side speaks version {VERSION} of the protocol, the other one {_quote(version)}; install the same "
-            "version of wiw on both",
+            f"this side speaks version {VERSION} of the protocol, the other {_quote(version)}; install the same "
+            "version of wiw on both sides",
             "version",
         )
     kind = KINDS.get(name) if isinstance(name, str) else None
@@ -144,7 +144,7 @@ def unpack_map(what: str, data: Any) -> dict[Any, Any]:
     try:
         values = msgpack.unpackb(data, list_hook=count, object_hook=count, **limits)
     except Exception as error:  # msgpack raises ValueError and others besides
-        raise RemoteError(f"{what}: no msgpack: {type(error).__name__}: {error}", "message") from None
+        raise RemoteError(f"{what}: not valid msgpack: {type(error).__name__}: {error}", "message") from None
     if not isinstance(values, dict):
         raise RemoteError(f"{what}: expected a map, got {type(values).__name__}", "message")
     return values
@@ -174,7 +174,7 @@ def read_fields(what: str, values: Mapping[Any, Any], readers: Mapping[str, Read
     """
     if set(values) != set(readers):
         missing, others = sorted(set(readers) - set(values)), len(set(values) - set(readers))
-        raise RemoteError(f"{what}: missing are {missing}, unknown are {others} fields", "message")
+        raise RemoteError(f"{what}: missing fields {missing}, unknown fields {others}", "message")
     return {name: reader(f"{what}.{name}", values[name]) for name, reader in readers.items()}
 
 

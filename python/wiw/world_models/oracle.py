@@ -110,13 +110,13 @@ class ArmOracle(Oracle):
 
 
 def make_oracle(space: str = PRIMITIVES, size: Sequence[int] | None = None, view: View | None = None) -> Oracle:
-    """Carry each plan out in a fork of the simulator.
+    """Execute each plan in a fork of the simulator.
 
     Return the model for plans of a space; `size` and `view` as for `Oracle`.
     """
     made = {PRIMITIVES: Oracle, GRIPPER_POSES: ArmOracle}.get(space)
     if made is None:
         raise ArgumentError(
-            f"oracle: expected plans in {PRIMITIVES} or {GRIPPER_POSES}, got '{space}'; write one for yours"
+            f"oracle: expected plans in {PRIMITIVES} or {GRIPPER_POSES}, got '{space}'; implement an oracle for yours"
         )
     return made(size, view)

@@ -81,8 +81,8 @@ class Missing(ContentDegradation):
     """Things that are not there."""
 
     kind = "missing"
-    about = "Leaves things out, each drawn for itself: furniture and small things, or what is on a table."
-    unit = "share of the things"
+    about = "Leaves out random objects: furniture and small things, or what is on a table."
+    unit = "share of the objects"
     doses = per_space((0.25, 0.5, 1.0))
     most = 1.0
 
@@ -103,7 +103,7 @@ class Moved(ContentDegradation):
     """Things that are elsewhere."""
 
     kind = "moved"
-    about = "Moves every thing horizontally, each in a direction of its own, through whatever is there."
+    about = "Moves every object horizontally, each in its own direction, through whatever is there."
     unit = "metres"
     doses = per_space((0.25, 0.5, 1.0), (0.03, 0.1, 0.3))
 
@@ -129,8 +129,8 @@ class Invented(ContentDegradation):
     """Things that do not exist."""
 
     kind = "invented"
-    about = "Shows copies of things of the scene where there are none, on free floor within 4 m or on the table."
-    unit = "copies per thing of the scene"
+    about = "Shows copies of the scene's objects where there are none, on free floor within 4 m or on the table."
+    unit = "copies per object of the scene"
     doses = per_space((0.25, 0.5, 1.0))
     most = 1.0
 
@@ -164,10 +164,7 @@ class OpenSpace(ContentDegradation):
     """Hallucinated free space."""
 
     kind = "open"
-    about = (
-        "Leaves out the walls, doors and windows of rooms, each drawn for itself, and goes on where a step is blocked, "
-        "drawn for each step."
-    )
+    about = "Leaves out random walls, doors and windows of rooms, and at random moves on where a step is blocked."
     unit = "share of the walls, doors and windows, and of the blocked steps"
     doses = per_space((0.25, 0.5, 1.0), ())
     most = 1.0
@@ -234,7 +231,7 @@ def _list_instances(scene: Any, words: str, belongs: Any) -> Instances:
     found = [each for each in drawn if each["category"] and belongs(each["category"])]
     if not found:
         raise ArgumentError(
-            f"scene {scene.name} has no {words} that could be drawn otherwise; expected a scene whose instances have "
+            f"scene {scene.name} has no {words} that could be changed; expected a scene whose instances have "
             "categories, such as a generated apartment"
         )
     low, high = scene.bounds

@@ -109,8 +109,8 @@ class Scale(MotionDegradation):
     """Motion that leads too far."""
 
     kind = "scale"
-    about = "Makes each stride and each turn longer, and each way of a gripper."
-    unit = "share of the true length that is added"
+    about = "Makes each step, each turn and each gripper motion longer."
+    unit = "added share of the true length"
     doses = per_space((0.5, 1.0, 2.0), (0.25, 0.5, 1.0))
 
     def change_moves(self, moves: Moves, generator: np.random.Generator) -> Moves:
@@ -128,8 +128,8 @@ class Direction(MotionDegradation):
     """Motion to one side."""
 
     kind = "direction"
-    about = "Turns each stride to one side of its heading, and each way of a gripper about the vertical."
-    unit = "degrees; to which side is drawn for each future"
+    about = "Turns each step to one side of its heading, and each gripper motion about the vertical."
+    unit = "degrees; the side is random for each future"
     doses = per_space((30.0, 90.0, 180.0), (10.0, 30.0, 90.0))
     most = 180.0
     draws_future = True
@@ -155,7 +155,7 @@ class Lag(MotionDegradation):
     """Frames that are behind the plan."""
 
     kind = "lag"
-    about = "Shows after each action what followed an earlier one."
+    about = "Shows after each action the frame that followed an earlier one."
     unit = "actions"
     doses = per_space((1.0, 2.0, 4.0), (1.0, 2.0, 3.0))
 
@@ -177,7 +177,7 @@ class Drift(MotionDegradation):
 
     kind = "drift"
     about = "Shifts the camera, or the gripper, sideways with every action."
-    unit = "metres per action; the direction is drawn for each future"
+    unit = "metres per action; the direction is random for each future"
     doses = per_space((0.05, 0.1, 0.2), (0.02, 0.05, 0.1))
     draws_future = True
 
@@ -197,7 +197,7 @@ class Ignored(MotionDegradation):
     """Actions without effect."""
 
     kind = "ignored"
-    about = "Leaves out actions, each drawn for itself: nothing moves then."
+    about = "Ignores random actions: nothing moves after them."
     unit = "share of the actions"
     doses = per_space((0.25, 0.5, 1.0))
     most = 1.0

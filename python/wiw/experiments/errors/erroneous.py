@@ -90,7 +90,7 @@ class Erroneous(ModelImaginer):
         if not isinstance(env, NavigationEnv):
             raise ArgumentError(
                 f"error '{self.error}' moves the camera in the episode's world: expected an environment of "
-                f"wiw.envs.NavigationEnv, got {type(env).__name__}; run it by wiw.evaluate"
+                f"wiw.envs.NavigationEnv, got {type(env).__name__}; run it with wiw.evaluate"
             )
         return WorldFork(fork, env.state.world, env.task.motion == "slide")
 
@@ -140,6 +140,6 @@ def require_error(error: Degradation, space: str, has_simulator: bool) -> None:
         )
     if error.needs_simulator and not has_simulator:
         raise ArgumentError(
-            f"error '{error.kind}' acts in the simulator that only the oracle is handed: expected error-{error}, "
-            "without another model; blur, noise, tint, resolution and flicker go with any"
+            f"error '{error.kind}' acts in the simulator, which only the oracle is given: expected error-{error}, "
+            "without another model; blur, noise, tint, resolution and flicker work with any model"
         )

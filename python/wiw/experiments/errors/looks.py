@@ -61,7 +61,7 @@ class Blur(FrameDegradation):
 
     kind = "blur"
     family = "looks"
-    about = "Blurs each frame by a Gaussian."
+    about = "Blurs each frame with a Gaussian."
     unit = "standard deviation in pixels of a frame 1024 wide"
     doses = per_space((4.0, 16.0, 64.0))
 
@@ -81,8 +81,8 @@ class Resolution(FrameDegradation):
 
     kind = "resolution"
     family = "looks"
-    about = "Shrinks each frame and enlarges it again, by areas and by linear interpolation."
-    unit = "side of a pixel in pixels of a frame 1024 wide, less one"
+    about = "Downsamples each frame by area averaging and upsamples it by linear interpolation."
+    unit = "side of a low-resolution pixel, in pixels of a frame 1024 wide, minus one"
     doses = per_space((7.0, 31.0, 127.0))
 
     def degrade(self, frame: Image, seed: int, index: int, panorama: bool) -> Image:
@@ -98,7 +98,7 @@ class Noise(FrameDegradation):
 
     kind = "noise"
     family = "looks"
-    about = "Adds Gaussian noise to each channel of each pixel of a frame 1024 wide, drawn anew for each frame."
+    about = "Adds Gaussian noise, independent for each frame, to each channel of each pixel of a frame 1024 wide."
     unit = "standard deviation in grey levels of 255"
     doses = per_space((10.0, 40.0, 120.0))
 
@@ -113,7 +113,7 @@ class Tint(FrameDegradation):
 
     kind = "tint"
     family = "looks"
-    about = "Adds one colour to all pixels of a future, drawn from all directions in RGB."
+    about = "Adds one colour, in a random direction of RGB, to all pixels of a future."
     unit = "length of the colour in grey levels of 255"
     doses = per_space((15.0, 40.0, 100.0))
     draws_future = True
@@ -129,7 +129,7 @@ class Flicker(FrameDegradation):
 
     kind = "flicker"
     family = "flicker"
-    about = "Adds soft patches of colour, 16 across, to each frame, drawn anew for each."
+    about = "Adds soft patches of random colour, 16 across, to each frame independently."
     unit = "standard deviation in grey levels of 255"
     doses = per_space((8.0, 20.0, 60.0))
 

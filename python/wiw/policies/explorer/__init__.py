@@ -82,7 +82,7 @@ class Explorer(Policy):
         self.labeller: Labeller = LABELLERS.make(perception)
         if "ids" in self.labeller.needs:
             raise ArgumentError(
-                f"explorer: {type(self.labeller).__name__} knows the simulator's instances, which no agent is given; "
+                f"explorer: {type(self.labeller).__name__} needs the simulator's instance ids, which agents never see; "
                 "policy explorer-oracle is an explorer with true perception"
             )
         self.sure, self.imagination, self.path, self.affinity, self.budget = sure, imagination, path, affinity, budget
@@ -98,7 +98,7 @@ class Explorer(Policy):
         """
         if task.get("judge") is None:
             raise ArgumentError(
-                f"policy explorer answers questions about a home, and task '{task.get('task', 'of this run')}' asks "
+                f"policy explorer answers questions about a home, but task '{task.get('task', 'of this run')}' asks "
                 "none; use it with task aeqa (`wiw run aeqa`)"
             )
 

@@ -43,9 +43,9 @@ class GeometricMemory(Memory):
 
 
 class Geometric(Matcher):
-    """The matcher, attracted to the goal camera's position by SIFT matches, true depth and PnP with RANSAC.
+    """The matcher, attracted to the goal camera's position, which SIFT matches, true depth and PnP with RANSAC give.
 
-    A classical baseline beside learned imagination: it needs depth and texture, but no imagination.
+    A classical baseline for comparison with learned imagination: it needs depth and texture, but no imagination.
     """
 
     def begin(self, goal: Goal, key: Key) -> GeometricMemory:

@@ -85,7 +85,7 @@ class Memory:
 
 
 class Matcher(Policy):
-    """Explores where nothing matches, and climbs the similarity to the goal image where something does.
+    """Explores while nothing matches the goal image, and climbs the similarity to it once something does.
 
     Without a world model it takes the best of all 16 headings by what it really sees; with one, the best plans are
     imagined, and the similarity of the imagined places decides between them.

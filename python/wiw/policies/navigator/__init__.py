@@ -75,7 +75,7 @@ class NavigatorOptions:
     def __post_init__(self) -> None:
         if min(self.patience, self.overlap) <= 0 or self.targets < 1 or min(vars(self).values()) < 0:
             raise ArgumentError(
-                f"policy navigator: expected patience and overlap above 0, targets of 1 or more and no number below 0, "
+                "policy navigator: expected patience and overlap above 0, at least 1 target and no negative number, "
                 f"got {self}"
             )
         if not (self.doubt < 1 and self.commitment <= 1):
@@ -116,7 +116,7 @@ class _Outlook:
 
 
 class Navigator(Policy):
-    """Heads for where the goal probably is, and keeps to it until something better is known.
+    """Heads for the most probable place of the goal, and sticks to it until a better one is known.
 
     It needs depth, of which its map is made. Without a world model it takes the plan that is worth most by what was
     really seen. Front views of perspective models count as panoramas of which no more is shown.
@@ -172,7 +172,7 @@ class Navigator(Policy):
             memory, observation = situation.memory, situation.observation
             if observation.depth is None:
                 raise ArgumentError(
-                    "policy navigator makes its map of depth, and the observation has none; grant depth "
+                    "policy navigator builds its map from depth, but the observation has none; enable depth "
                     "(NavigationEnv(task, depth=True)), or use a policy without a map, such as vlm"
                 )
             pose = np.asarray(observation.odometry, np.float64)

@@ -82,7 +82,7 @@ def find_scans(kind: str, folder: Path, split: str = "") -> list[Path]:
         FileError: there is no such folder, or it holds no scan of that kind.
     """
     if kind not in KINDS:
-        raise ArgumentError(f"'{kind}' is no kind of scan; expected one of {', '.join(KINDS)}")
+        raise ArgumentError(f"'{kind}' is not a kind of scan; expected one of {', '.join(KINDS)}")
     find = {"mp3d": matterport.find, "hm3d": hm3d.find, "replica": replica.find}.get(kind, scene_dataset.find)
     return find(folder, split)
 

@@ -108,7 +108,7 @@ def read_house(path: Path) -> House:
                 read(words, categories, house)
             except (ValueError, IndexError, KeyError) as error:
                 raise FileError(
-                    f"{path}: line {number}: no record '{kind}' of a house ({type(error).__name__}: {error})"
+                    f"{path}: line {number}: not a house record '{kind}' ({type(error).__name__}: {error})"
                 ) from error
     _check_counts(path, records, house)
     return house
@@ -142,7 +142,7 @@ def _add_object(words: list[str], categories: dict[int, Category], house: House)
     if len(box) < 12:
         raise ValueError("expected a centre, two axes and half sizes, twelve numbers")
     if region >= 0 and region not in house.regions:
-        raise ValueError(f"its region {region} is not there")
+        raise ValueError(f"its region {region} does not exist")
     nothing = Category("", "")
     kind = nothing if category < 0 else categories[category]
     axes = np.stack([box[3:6], box[6:9], np.cross(box[3:6], box[6:9])])
@@ -202,7 +202,7 @@ def read(file: Path, options: dict[str, Any]) -> Imported:
             rooms=listed,
             flat=True,
             attributes={**about, "labels": "none"},
-            warnings=[f"{semantic.name} is not there: no object has a label"],
+            warnings=[f"{semantic.name} does not exist: no object has a label"],
         )
         return Imported(scene, files, [*absent, semantic])
     vertices, triangles, object_ids, _ = _core.scene.read_ply_surface(
@@ -283,7 +283,9 @@ def compare_boxes(file: Path, scene: _core.scene.Scene) -> list[str]:
             far.extend([index] * bool(distance > FAR))
     if not far:
         return []
-    return [f"{len(far)} of {len(things)} objects lie over {FAR} m from their boxes in the house file: {_some(far)}"]
+    return [
+        f"{len(far)} of {len(things)} objects lie more than {FAR} m from their boxes in the house file: {_some(far)}"
+    ]
 
 
 def _some(numbers: Sequence[int]) -> str:

@@ -109,7 +109,7 @@ def rotation_of(quaternion: Iterable[float]) -> NDArray[np.float64]:
     w, x, y, z = np.array(list(quaternion), float)
     length = np.sqrt(w * w + x * x + y * y + z * z)
     if not length > 0 or not np.isfinite(length):
-        raise ValueError("a rotation is no quaternion")
+        raise ValueError("a rotation is not a quaternion")
     w, x, y, z = w / length, x / length, y / length, z / length
     return np.array(
         [

@@ -137,7 +137,7 @@ class Dataset:
             try:
                 names |= {int(entry["id"]): str(entry["name"]) for entry in read_object(file).get("classes", [])}
             except _UNREADABLE as error:
-                raise FileError(f"{file}: no lexicon of classes ({type(error).__name__}: {error})") from error
+                raise FileError(f"{file}: not a lexicon of classes ({type(error).__name__}: {error})") from error
             self.read.append(file)
         return names
 
@@ -321,7 +321,7 @@ def read(file: Path, options: dict[str, Any]) -> Imported:
     if assembly.missing:
         lost = list(dict.fromkeys(assembly.missing))
         listed = "\n  ".join(lost[:100]) + ("\n  ..." if len(lost) > 100 else "")
-        raise FileError(f"{file}: {len(lost)} things that it names are not in {dataset.path.parent}:\n  {listed}")
+        raise FileError(f"{file}: {len(lost)} objects that it names are not in {dataset.path.parent}:\n  {listed}")
     nameless = sum(not instance["category"] for instance in assembly.instances[1:])
     if nameless:
         assembly.warnings.append(f"{nameless} of {len(assembly.instances) - 1} objects have no category")

@@ -29,7 +29,7 @@ HUB = "facebook/nwm"
 
 @dataclass(kw_only=True, eq=False)
 class NWM(WorldModel):
-    """Navigation World Models: frame after frame, each from the last four and the motion to it (Bar et al. 2025).
+    """Navigation World Models: frame by frame, each from the last four and the motion to it (Bar et al. 2025).
 
     It sees the middle of the front view in 4:3; the rest of its frames is black. The first context is taken from
     `observations.history` at the spacing of its own frames (`context.py`); without one it is the observation repeated.
@@ -91,7 +91,7 @@ class NWM(WorldModel):
         import torch
 
         self._place = torch.device(self.device)
-        with devices.memory_guard("NWM", "its weights take about 4.5 GB; free the GPU of other programs"):
+        with devices.memory_guard("NWM", "its weights take about 4.5 GB; stop other programs that use the GPU"):
             self._network, self._codec = self._load_networks()
         self.accepts = replace(self.accepts, history=self._network.size.context)
         self._side = self._network.size.latent_side * 2 ** (len(self._codec.config.block_out_channels) - 1)

@@ -63,14 +63,14 @@ def load_cdit(path: Path) -> CDiT:
         size = Architecture.of(state)
     except KeyError as error:
         raise WeightsError(
-            f"{path}: no weights of a CDiT: there is no {error}; it holds {_some(sorted(state))}", "unfit"
+            f"{path}: not weights of a CDiT: expected {error}; it has {_some(sorted(state))}", "unfit"
         ) from None
     with torch.device("meta"):
         network = CDiT(size)
     expected = {name: tuple(value.shape) for name, value in network.state_dict().items()}
     found = {name: tuple(value.shape) for name, value in state.items()}
     if expected != found:
-        raise WeightsError(f"{path}: no weights of a CDiT of {size}: {_difference(expected, found)}", "unfit")
+        raise WeightsError(f"{path}: not weights of a CDiT of size {size}: {_difference(expected, found)}", "unfit")
     network.load_state_dict(state, assign=True)
     return network.float().eval().requires_grad_(False)
 
@@ -127,7 +127,7 @@ def _state(path: Path) -> dict[str, Tensor]:
     except (pickle.UnpicklingError, RuntimeError, EOFError) as error:
         raise WeightsError(
             f"{path}: not a checkpoint that can be read without running code from it ({_first_line(error)}); save its "
-            "'ema' with safetensors.torch.save_file and name that file",
+            "'ema' with safetensors.torch.save_file and use that file",
             "unfit",
         ) from error
     if not isinstance(checkpoint, dict) or not isinstance(checkpoint.get("ema"), dict):

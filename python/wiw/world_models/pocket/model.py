@@ -28,7 +28,7 @@ STEPS = 1
 
 
 class Pocket(Trained):
-    """Draw the views of a plan out of noise, together, by a diffusion model over small panoramas.
+    """Generate all views of a plan jointly with a diffusion model over small panoramas.
 
     The model is told where each view is taken from. It draws views that face where the observation does; turns are
     rolls of them, exact to a column. Views from where the agent stands are the observation itself. The model says how

@@ -43,13 +43,13 @@ class Links:
         for link, welcome in zip(self._links, found, strict=True):
             if not welcome.fingerprint:
                 raise RemoteError(
-                    f"{link.address}: several servers are used only for a model that can be told from another: "
-                    f"{welcome.unknown or 'it has no version'}; give one address, or have one server",
+                    f"{link.address}: several servers can only be used for a model that can be identified: "
+                    f"{welcome.unknown or 'it has no version'}; give one address, or use one server",
                     "model",
                 )
             if (welcome.fingerprint, welcome.accepts) != (found[0].fingerprint, found[0].accepts):
                 raise RemoteError(
-                    f"{link.address} serves another model than {self._links[0].address}: fingerprint "
+                    f"{link.address} serves a different model than {self._links[0].address}: fingerprint "
                     f"{welcome.fingerprint}, expected {found[0].fingerprint}; serve the same weights and options",
                     "model",
                 )

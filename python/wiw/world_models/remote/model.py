@@ -37,7 +37,7 @@ MARGIN = 0.05
 
 
 class Remote(WorldModel):
-    """A served world model: "remote:ws://HOST:PORT", where `wiw serve MODEL` runs.
+    """A world model served by `wiw serve MODEL` at "remote:ws://HOST:PORT".
 
     Args:
         address: "ws://HOST:PORT", or "wss://..." for a server behind TLS; several with commas between them share the
@@ -96,8 +96,8 @@ class Remote(WorldModel):
         ]
         if (longest := max(map(len, rows))) > (most := most_bytes(self.accepts) - OVERHEAD):
             raise RemoteError(
-                f"a row of {longest} bytes is more than the {most} that a server of this model takes; a smaller size, "
-                "or a shorter history if it needs one, makes it less",
+                f"a row of {longest} bytes exceeds the {most} that a server of this model accepts; use a smaller size, "
+                "or a shorter history if it needs one",
                 "row",
             )
         frames = np.empty((len(controls), 1 + len(controls[0].actions), *observations.image.shape[1:]), np.uint8)
@@ -155,5 +155,5 @@ def _check_address(address: str) -> str:
             f"got '{address}'"
         ) from None
     if uri.username or uri.query:
-        raise ArgumentError(f"remote: the address is written into records; put the token into {TOKEN} instead")
+        raise ArgumentError(f"remote: the address is stored in records; put the token into {TOKEN} instead")
     return address

@@ -30,7 +30,7 @@ SIDE = 960
 
 @dataclass(kw_only=True, eq=False)
 class RunwayGen4(WorldModel):
-    """Runway Gen-4: the front view and the plan in words become a clip, on Runway's servers, for money.
+    """Runway Gen-4: a clip from the front view and the plan in words, generated on Runway's servers for a fee.
 
     The key is read from the environment, RUNWAYML_API_SECRET. All rows of a call are begun at once and waited for
     together. A row that the service has confirmed is never begun again: a repeated question goes on waiting for it.
@@ -138,7 +138,7 @@ class RunwayGen4(WorldModel):
         prompt = write_prompt(control, self._words, self._alignment)
         if len(prompt.encode("utf-16-le")) > 2 * LONGEST_PROMPT:
             raise ArgumentError(
-                f"RunwayGen4: the service takes prompts of up to {LONGEST_PROMPT} characters, and {control.length} "
+                f"RunwayGen4: the service takes prompts of up to {LONGEST_PROMPT} characters, but {control.length} "
                 f"actions take {len(prompt)}; lower frames (now {self.frames})"
             )
         return {

@@ -63,5 +63,5 @@ def decode_video(content: bytes, size: tuple[int, int]) -> NDArray[np.uint8]:
             frames.append(cv2.cvtColor(small, cv2.COLOR_BGR2RGB))
         video.release()
     if not frames:
-        raise InfrastructureError(f"RunwayGen4: {len(content)} bytes came that are no video")
+        raise InfrastructureError(f"RunwayGen4: {len(content)} bytes were received, which are not a video")
     return np.asarray(np.stack(frames), np.uint8)

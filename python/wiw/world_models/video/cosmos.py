@@ -20,7 +20,7 @@ HUB = "nvidia/Cosmos-Predict2-2B-Video2World"
 
 @dataclass(kw_only=True, eq=False)
 class CosmosPredict2(TextVideoModel):
-    """Cosmos-Predict2 2B: the front view and the plan in words become a clip (NVIDIA 2025).
+    """Cosmos-Predict2 2B: a clip from the front view and the plan in words (NVIDIA 2025).
 
     Args:
         guardrail: whether NVIDIA's filter looks at prompts and frames. It has to be said: the licence of the weights
@@ -46,8 +46,8 @@ class CosmosPredict2(TextVideoModel):
     def __post_init__(self) -> None:
         if not isinstance(self.guardrail, bool):
             raise ArgumentError(
-                "CosmosPredict2: say guardrail=True (NVIDIA's filter; pip install cosmos_guardrail) or guardrail=False "
-                "(without it; the licence of the weights asks for a filter of your own)"
+                "CosmosPredict2: choose guardrail=True (NVIDIA's filter; pip install cosmos_guardrail) or "
+                "guardrail=False (without it; the licence of the weights requires you to use your own filter)"
             )
         super().__post_init__()
 

@@ -22,7 +22,7 @@ DROPPED = 4
 
 @dataclass(kw_only=True, eq=False)
 class Hunyuan(TextVideoModel):
-    """HunyuanVideo I2V 13B: the front view and the plan in words become a clip (Kong et al. 2024).
+    """HunyuanVideo I2V 13B: a clip from the front view and the plan in words (Kong et al. 2024).
 
     Both kinds of checkpoint run: those that replace the first token by the observation, and those that concatenate it
     (33 channels; use guidance=1 with them). The latter lose the first frames, so more are asked for, and the clip is

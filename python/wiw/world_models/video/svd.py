@@ -16,7 +16,7 @@ HUB = "stabilityai/stable-video-diffusion-img2vid"
 
 @dataclass(kw_only=True, eq=False)
 class SVD(VideoModel):
-    """Stable Video Diffusion: the front view comes to life; the plan does not steer it (Blattmann et al. 2023).
+    """Stable Video Diffusion: a clip from the front view; the plan does not control it (Blattmann et al. 2023).
 
     Frame k of the clip stands for what follows action k.
 

@@ -25,7 +25,7 @@ STILL = 1e-4
 
 
 class WarpNet(Trained):
-    """Guess how far away everything will be, warp the panorama by that, and paint what the warp cannot know.
+    """Predict the depth of the new panorama, warp the present one by it, and inpaint what the warp cannot know.
 
     Where a plan leads is one jump (turn towards the place, go straight, turn back), however many primitives it takes,
     so errors do not add up. Turns are rolls of the panorama, exact to a column. Colours come from the panorama in full

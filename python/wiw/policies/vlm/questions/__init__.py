@@ -93,8 +93,8 @@ class QuestionVLM(VLM):
         self.labeller: Labeller = LABELLERS.make(perception)
         if "ids" in self.labeller.needs:
             raise ArgumentError(
-                f"policy vlm: {type(self.labeller).__name__} reads the simulator's instance ids, which no agent is "
-                "given; expected perception that sees images alone, such as learned"
+                f"policy vlm: {type(self.labeller).__name__} needs the simulator's instance ids, which agents never "
+                "see; expected perception that uses only images, such as learned"
             )
         self.history, self.order = history, order
         self.needs = ("depth",)

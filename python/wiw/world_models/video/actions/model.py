@@ -98,7 +98,7 @@ class ActionConditioned(WorldModel):
         config, stride = ActionConfig.load(self._folder), self.generator_class.stride
         if config.base != self.base or config.stride != stride:
             raise WeightsError(
-                f"{self._folder} was trained for {config.base} with {config.stride} frames a latent, but this is "
+                f"{self._folder} was trained for {config.base} with {config.stride} frames per latent, but this is "
                 f"{self.base} with {stride}; use the world model {config.base}-action",
                 "unfit",
             )
