@@ -222,19 +222,3 @@ class _Nothing:
 
     def load_state_dict(self, state: Any) -> None:
         pass
-
-
-def test_the_command_refuses_what_it_has_no_use_for(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    out = ["--out", str(tmp_path / "x")]
-    assert main(["train", "armnet", *out, "--categories", "chair"]) == 2
-    assert "has no categories" in capsys.readouterr().err
-    assert main(["train", "armnet", *out, "--places", "3"]) == 2
-    assert "--plays" in capsys.readouterr().err
-    assert main(["train", "warpnet", *out, "--plays", "3"]) == 2
-    assert "--plays: warpnet" in capsys.readouterr().err
-    for count in ("0", "-5"):
-        assert main(["train", "armnet", *out, "--plays", count]) == 2
-        assert f"--plays: expected 1 or more, got {count}" in capsys.readouterr().err
-    for flag, said in (("--scenes", "does not train on scenes"), ("--val", "is not measured on scenes")):
-        assert main(["train", "armnet", *out, flag, "apartments:train:1"]) == 2
-        assert f"{flag}: armnet {said}" in capsys.readouterr().err

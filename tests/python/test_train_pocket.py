@@ -246,7 +246,6 @@ def test_the_command_trains_measures_and_is_run(
     [
         ([], "pocket trains on a dataset; give a folder of `wiw collect navigation` by --data"),
         (["--data", "nowhere"], "nowhere"),
-        (["--data", "d", "--device", "cuda"], "--device: pocket trains on the CPU"),
         (["--data", "d", "--option", "lr=1"], "recipe: unknown name 'lr'"),
     ],
 )

@@ -114,9 +114,3 @@ def test_scenes_without_room_ahead_are_told(two_rooms: str, monkeypatch: pytest.
     model = WarpNet.of(Network(8, (4, 4, 4)))
     with pytest.raises(ArgumentError, match=r"1\.6 m free"):
         evaluate(model, two_rooms, 0)
-
-
-def test_the_command_refuses_what_it_has_no_use_for(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    out = ["--out", str(tmp_path / "x")]
-    assert main(["train", "warpnet", *out, "--categories", "chair"]) == 2
-    assert "has no categories" in capsys.readouterr().err

@@ -10,6 +10,7 @@ import sys
 from pathlib import Path
 from typing import Any
 
+import cv2
 import numpy as np
 import pytest
 from hypothesis import given, settings
@@ -19,18 +20,38 @@ import wiw
 from wiw.action import FORWARD, TURN_LEFT, TURN_RIGHT, to_trajectory
 from wiw.datasets.cameras import camera_pose
 from wiw.datasets.worlds import world
-from wiw.errors import DependencyError, WeightsError
+from wiw.errors import ArgumentError, DependencyError, WeightsError
 from wiw.reproject import pose
 from wiw.reproject import warp as true_warp
 from wiw.types import Conditioning, Control
 
 torch = pytest.importorskip("torch", reason="needs wiw[torch]")
 
-from wiw.world_models.warpnet.model import BUILT_IN, WarpNet, to_network, turn_panorama  # noqa: E402
+from wiw.world_models.warpnet.model import BUILT_IN, WarpNet, shrink_panorama, to_network, turn_panorama  # noqa: E402
 from wiw.world_models.warpnet.network import Network, enlarge_panorama, rays, warp  # noqa: E402
 from wiw.world_models.warpnet.weights import load, save  # noqa: E402
 
 SIZE = (96, 192)
+
+
+def test_a_smaller_size_shows_the_same_and_is_part_of_its_identity() -> None:
+    usual, small = WarpNet(), WarpNet(size=(144, 256))
+    assert (usual.accepts.size, small.accepts.size) == ((576, 1024), (144, 256))
+    assert "size" not in usual.describe()
+    assert small.describe() == usual.describe() | {"size": [144, 256]}
+    blurred = cv2.GaussianBlur(noise(1)[0], (0, 0), 5)
+    large = cv2.resize(blurred, (1024, 576))[None]
+    plan = control([FORWARD, TURN_LEFT, FORWARD])
+    seen = rollout(usual, large, [plan])[0]
+    imagined = rollout(small, shrink_panorama(large[0], (144, 256))[None], [plan])[0]
+    for own, other in zip(imagined, seen, strict=True):
+        assert np.abs(own - shrink_panorama(other, (144, 256)).astype(float)).mean() < 2
+
+
+@pytest.mark.parametrize("size", [(16, 32), (144,), (72, 142)])
+def test_a_size_below_the_networks_is_refused(size: Any) -> None:
+    with pytest.raises(ArgumentError, match=r"at least \(72, 144\)"):
+        WarpNet(size=size)
 
 
 def untrained(seed: int = 0) -> WarpNet:

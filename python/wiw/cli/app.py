@@ -24,7 +24,7 @@ from wiw.cli.demo import demo
 from wiw.cli.doctor import doctor
 from wiw.cli.episodes import episodes
 from wiw.cli.export import export
-from wiw.cli.flag_help import read_flags
+from wiw.cli.flag_help import join_lines, read_flags
 from wiw.cli.judge import judge
 from wiw.cli.merge import merge
 from wiw.cli.names import list_names
@@ -44,7 +44,7 @@ from wiw.cli.study import STUDIES
 from wiw.cli.study_file import run_study
 from wiw.cli.submit import cancel, submit
 from wiw.cli.terminal import printable
-from wiw.cli.train import train
+from wiw.cli.train.commands import TRAININGS
 from wiw.cli.verify import verify
 from wiw.cli.view import view
 from wiw.errors import Error
@@ -93,11 +93,6 @@ COMMANDS: tuple[tuple[Callable[..., int], str, str], ...] = (
     (doctor, "doctor", "Check this machine, and say how to fix what is missing."),
     (serve_vlm, "serve-vlm", "Serve a small vision-language model on this machine, for tests."),
     (episodes, "episodes", "Write episodes to a file that anyone can run."),
-    (
-        train,
-        "train",
-        "Train a network: recogniser, navigator, warpnet, pocket, perception, armnet, diffuser or a video model.",
-    ),
 )
 
 
@@ -147,6 +142,19 @@ GROUPS: Mapping[str, Group] = {
             (collect_decisions, "decisions", "Decisions between plans, with the true outcome of each plan."),
         ),
         default="manipulation",
+    ),
+    "train": Group(
+        "Train a network: recogniser, navigator, warpnet, pocket, perception, armnet, diffuser or a video model.",
+        """Train a network: recogniser, navigator, warpnet, pocket, perception, armnet, diffuser or a video model.
+All but video models train on a CPU, in minutes to hours. Repeat an interrupted command to resume it.
+
+  $ wiw train warpnet --out warpnet.safetensors
+  $ wiw train recogniser --scenes house.glb --val other.glb --out house.safetensors
+  $ wiw train pocket --data data --out pocket.safetensors
+  $ wiw train ltx-action --data data --out runs/ltx
+
+`wiw train NAME --help` explains each with examples.""",
+        TRAININGS,
     ),
     "data": Group(
         "Check, summarise or draw a navigation dataset; convert collected data to and from LeRobot's format.",
@@ -280,7 +288,9 @@ def _dispatch(arguments: Sequence[str]) -> Any:
     app = tyro.extras.SubcommandApp()
     named = any(name == known for _, known, _ in COMMANDS)
     for function, known, line in COMMANDS:
-        app.command(name=known, help=None if named else line)(function)  # None: the function's own docstring
+        app.command(name=known, help=None if named else line)(
+            join_lines(function)
+        )  # None: the function's own docstring
     for known, group in GROUPS.items():
         app.command(name=known, help=group.line)(_name_group)
     return _run_app(app, "wiw", DESCRIPTION, [name, *rest])
@@ -296,7 +306,7 @@ def _dispatch_group(name: str, arguments: Sequence[str]) -> Any:
         given = [group.default, *given]
     app = tyro.extras.SubcommandApp()
     for function, each, line in group.commands:
-        app.command(name=each, help=None if given[0] in known else line)(function)
+        app.command(name=each, help=None if given[0] in known else line)(join_lines(function))
     return _run_app(app, f"wiw {name}", group.description, given)
 
 

@@ -1,18 +1,27 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Build the help of flags that a dataclass declares, one paragraph each.
+"""Build the help of flags, one paragraph each.
 
-tyro takes the description of a field from its docstring, and keeps every line break there. It also adds "(default:
-None)" to flags whose description already says what the default is.
+tyro takes the description of a flag from a docstring, and keeps every line break there. To flags that a dataclass
+declares it also adds "(default: None)", even if their description already says what the default is.
 """
 
 from __future__ import annotations
 
 import dataclasses
+import re
+from collections.abc import Callable
 from functools import lru_cache, partial
 from typing import Annotated, Any, get_type_hints
 
 from tyro.conf import arg
 from tyro.constructors import StructConstructorSpec, StructFieldSpec, StructTypeInfo
+
+
+def join_lines(command: Callable[..., int]) -> Callable[..., int]:
+    """Make the description of each argument in a command's docstring one line; return the command."""
+    text, heading, arguments = (command.__doc__ or "").partition("\n    Args:\n")
+    command.__doc__ = text + heading + re.sub(r"\n {12}(?=\S)", " ", arguments)
+    return command
 
 
 def read_flags(info: StructTypeInfo) -> StructConstructorSpec | None:

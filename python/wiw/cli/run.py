@@ -46,7 +46,7 @@ def run(
     $ wiw run imagenav --world-model warp --episodes 50
     $ wiw run imagenav --arms none,copy,warp,oracle --workers 2 --out runs/first
     $ wiw run imagenav --world-model my_model.py:MyModel --arms none,oracle,heuristic+none
-    $ wiw run imagenav --arms none,big=warpnet?weights=big.npz,small=warpnet?weights=small.npz,oracle
+    $ wiw run imagenav --arms none,big=warpnet?weights=big.safetensors,small=warpnet?weights=small.safetensors,oracle
     $ wiw run imagenav --scenes house.glb --world-model warp
     $ wiw run imagenav --preset foresight --tier all --episodes 180 --arms none,warp,oracle
     $ wiw run imagenav --episode-file val.json.gz --scene-folder scans

@@ -60,6 +60,11 @@ class Checkpoint:
         self._identity = json.dumps(dict(identity), sort_keys=True)
         self._last_saved = time.monotonic()
 
+    @classmethod
+    def beside(cls, out: Path, identity: Mapping[str, Any]) -> Checkpoint:
+        """Return the checkpoint of the training that writes `out`, in the file beside it."""
+        return cls(out.with_name(f"{out.name}.checkpoint"), identity)
+
     def load(self) -> TrainingState | None:
         """Read the file; None where there is none.
 

@@ -1,0 +1,143 @@
+# SPDX-License-Identifier: Apache-2.0
+"""`wiw train pocket`."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any, Literal
+
+from tyro.conf import arg
+
+from wiw.cli.options import Options
+from wiw.cli.train.corpus import TrackerName, describe_steps, require_data
+from wiw.cli.train.progress import TrainingProgress, track_items
+from wiw.cli.train.small_networks import (
+    VAL_SCENES,
+    Count,
+    Preparation,
+    check_counts,
+    check_seed,
+    drop_none,
+    write_weights,
+)
+from wiw.errors import ArgumentError
+
+if TYPE_CHECKING:
+    from wiw.datasets.navigation import NavigationData
+    from wiw.training.pocket.recipe import PocketRecipe
+
+
+def train_pocket(
+    *,
+    data: Annotated[Path | None, arg(metavar="DIR", help_behavior_hint="")] = None,
+    out: Annotated[Path, arg(metavar="FILE")] = Path("pocket.safetensors"),
+    val: Annotated[str, arg(metavar="SPEC")] = VAL_SCENES,
+    recipe: Annotated[Path | None, arg(metavar="YAML", help_behavior_hint="")] = None,
+    option: Options = (),
+    part: Literal["train", "all"] = "train",
+    validation: Annotated[Path | None, arg(metavar="DIR", help_behavior_hint="")] = None,
+    decisions: Annotated[Path | None, arg(metavar="FILE", help_behavior_hint="")] = None,
+    tracker: TrackerName | None = None,
+    epochs: Count = None,
+    seed: Annotated[int, arg(metavar="N")] = 0,
+    cache: Annotated[Path | None, arg(metavar="DIR", help_behavior_hint="")] = None,
+) -> int:
+    """Train pocket, a world model of navigation: a small video diffusion model that draws all views of a plan together.
+    It starts from random weights.
+
+    $ wiw collect navigation --scenes apartments:train:80 --out data
+    $ wiw train pocket --data data --out pocket.safetensors
+    $ wiw train pocket --data data --option clips=1600 --out short.safetensors
+    $ wiw run imagenav --world-model pocket --world-model-option weights=pocket.safetensors
+
+    Training takes two to three hours on two idle cores, less with --option clips=N. Repeat an interrupted command to
+    resume it; SIGUSR1 writes the checkpoint at once. FILE also holds the recipe, and PSNR on windows of the val scenes,
+    beside models that have learned nothing, and how much of it is lost under the places of another window. The weights
+    that come with wiw were trained on 16 800 clips.
+
+    Args:
+        data: Dataset of `wiw collect navigation`.
+        out: Weights, a safetensors file.
+        val: Held-out scenes to measure it on; none may be trained on.
+        recipe: YAML file with numbers of the recipe, on top of the shipped ones.
+        option: Number of the recipe, such as rate=2e-5, clips=1600 or batch=8; may be given again. See
+            `wiw.training.pocket.recipe.PocketRecipe`.
+        part: Part of the dataset: train leaves out one in twenty scenes for validation.
+        validation: Another dataset, of other scenes, to validate on while it trains: PSNR and SSIM after 1, 4, 8 and 14
+            actions, and the control gap. Default: the scenes that --part train leaves out.
+        decisions: File of `wiw collect decisions`, by which validation also measures how well the model's order of the
+            plans agrees with the true one.
+        tracker: Program that draws loss and validation; needs its package. OUT.log/metrics.jsonl has the same in any
+            case.
+        epochs: How often each clip is used, on average. Default: 1.
+        seed: Seed of the order of clips and of the weights.
+        cache: Folder of prepared training data; it can be deleted at any time. Default: $WIW_CACHE/looks.
+    """
+    from wiw.runs.part_options import parse_options
+    from wiw.training.pocket.recipe import PocketRecipe
+    from wiw.training.post_training.recipe import load_recipe
+    from wiw.world_models.devices import require
+    from wiw.world_models.pocket.model import Pocket
+
+    check_counts(epochs=epochs)
+    check_seed(seed)
+    require(Pocket.requires)
+    with write_weights("pocket", out):
+        numbers = drop_none({"epochs": epochs, "seed": seed or None})
+        options = {**numbers, **parse_options(option, PocketRecipe, "--option")}
+        chosen = load_recipe("pocket", recipe, options, kind=PocketRecipe)
+        watched = {"part": part, "validation": validation, "decisions": decisions, "tracker": tracker}
+        _train(out, require_data("pocket", data), Preparation(cache=cache).folder, val, chosen, watched)
+    return 0
+
+
+def _train(out: Path, data: Path, cache: Path, val: str, recipe: PocketRecipe, watched: Mapping[str, Any]) -> None:
+    from wiw.datasets.navigation import NavigationData
+    from wiw.training.pocket import train as training
+    from wiw.training.pocket.held_out import evaluate
+    from wiw.world_models.pocket.model import Pocket
+    from wiw.world_models.pocket.weights import load, save
+
+    _check_held_out(val, NavigationData(data, watched["part"], recipe.held_out))  # before hours of training
+    with TrainingProgress(recipe.batch, "clips") as progress:
+        card = training.train_pocket(
+            data,
+            out,
+            cache,
+            recipe,
+            on_step=progress,
+            on_validation=progress.show_validation,
+            bar=track_items,
+            **watched,
+        )
+    card["val"] = val
+    card["held_out"] = evaluate(Pocket(out), val, recipe.seed, bar=track_items)
+    save(out, load(out)[0], card)
+    _report(card)
+    print(f"log       {out}.log")
+
+
+def _check_held_out(val: str, data: NavigationData) -> None:
+    """Check that scenes are there and are not trained on; a dataset knows its scenes by name alone."""
+    from wiw.datasets.scene_splits import name_scene
+    from wiw.scenes import resolve, strip_edits
+
+    trained = {strip_edits(row["scene"]) for row in data.segments}
+    shared = next((spec for spec in resolve(val) if strip_edits(name_scene(spec)) in trained), None)
+    if shared is not None:
+        raise ArgumentError(
+            f"--val: expected held-out scenes that are not trained on, got {shared}, and {data.folder} has a scene of "
+            "that name; choose others"
+        )
+
+
+def _report(card: Mapping[str, Any]) -> None:
+    print(describe_steps(card, card["recipe"]["batch"]))
+    for kind, found in card["held_out"].items():
+        print(f"{f'{kind}: steps of 0.2 m ahead':<30}" + "".join(f"{step:>8}" for step in found["psnr"]["copy"]))
+        for name, values in found["psnr"].items():
+            print(f"  {name:<28}" + "".join(f"{values[step]:8.1f}" for step in values))
+        if found["gap"]:
+            print(f"  {'control gap':<28}" + "".join(f"{value:8.1f}" for value in found["gap"].values()))
+    print("PSNR in dB of whole panoramas, weighted by latitude; the gap is what is lost when others' places are shown")

@@ -1,0 +1,130 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Options and checks that the small networks share: they train in one process, on the CPU, into one file."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Annotated, Any
+
+from tyro.conf import arg
+
+from wiw.cli.stop import announce_resume
+from wiw.cli.train.progress import track_items
+from wiw.errors import ArgumentError
+from wiw.training.launcher import require_single_process
+
+VAL_SCENES = "apartments:val:20"
+Count = Annotated[int | None, arg(metavar="N", help_behavior_hint="")]
+"""A number that the recipe has where it is not given."""
+
+
+def drop_none(options: Mapping[str, Any]) -> dict[str, Any]:
+    """Return the options that are not None."""
+    return {name: value for name, value in options.items() if value is not None}
+
+
+def check_counts(**counts: int | None) -> None:
+    """Refuse counts below 1, by the names of their options."""
+    for name, count in drop_none(counts).items():
+        if count < 1:
+            raise ArgumentError(f"--{name}: expected 1 or more, got {count}")
+
+
+def check_seed(seed: int) -> None:
+    """Refuse seeds that are out of range."""
+    if not 0 <= seed < 2**63:
+        raise ArgumentError(f"--seed: expected 0 to 2**63 - 1, got {seed}")
+
+
+@dataclass(frozen=True, kw_only=True)
+class Preparation:
+    """How training data is prepared.
+
+    Raises:
+        ArgumentError: no workers.
+    """
+
+    workers: Annotated[int, arg(metavar="N")] = 2
+    """Processes that prepare the training data."""
+    cache: Annotated[Path | None, arg(metavar="DIR", help_behavior_hint="")] = None
+    """Folder of prepared training data; it can be deleted at any time. Default: $WIW_CACHE/looks."""
+
+    def __post_init__(self) -> None:
+        check_counts(workers=self.workers)
+
+    @property
+    def folder(self) -> Path:
+        """Folder of prepared training data."""
+        from wiw.scenes.store import folder
+
+        return self.cache or folder().parent / "looks"
+
+    @property
+    def arguments(self) -> dict[str, Any]:
+        """Keyword arguments of the functions in `wiw.training.gather`."""
+        return {"folder": self.folder, "workers": self.workers, "bar": track_items}
+
+
+@dataclass(frozen=True, kw_only=True)
+class Limits:
+    """How long training may take, and its seed.
+
+    Raises:
+        ArgumentError: a number out of range.
+    """
+
+    minutes: Annotated[float | None, arg(metavar="MIN")] = None
+    """Train fewer epochs if all of them would take longer than this."""
+    seed: Annotated[int, arg(metavar="N")] = 0
+    """Seed of the training data and of the weights."""
+
+    def __post_init__(self) -> None:
+        if self.minutes is not None and not (self.minutes > 0 and math.isfinite(self.minutes)):
+            raise ArgumentError(f"--minutes: expected a number above 0, got {self.minutes}")
+        check_seed(self.seed)
+
+
+NO_LIMITS, PREPARATION = Limits(), Preparation()
+
+
+def check_scenes(scenes: str, val: str) -> None:
+    """Check that no scene is both trained and evaluated on, whatever its path or the edits of an apartment."""
+    from wiw.scenes import absolute, resolve, strip_edits
+
+    trained = {strip_edits(absolute(name)) for name in resolve(scenes)}
+    shared = next((name for name in resolve(val) if strip_edits(absolute(name)) in trained), None)
+    if shared is not None:
+        raise ArgumentError(
+            f"--val: expected held-out scenes that are not among --scenes, got {shared} in both; choose others"
+        )
+
+
+@contextmanager
+def write_weights(name: str, out: Path) -> Iterator[None]:
+    """Train one network into a file: check that this can be done first, and report the file's size at the end.
+
+    Raises:
+        ArgumentError: there are several processes, each of which would train alike and write the same file.
+        FileError: the file could not be written, which is found out before the minutes that training takes.
+    """
+    require_single_process(name, "run the command without torchrun")
+    _check_out(out)
+    with announce_resume():
+        yield
+    print(f"weights   {out} ({out.stat().st_size / 2**20:.2f} MB)")
+
+
+def _check_out(out: Path) -> None:
+    from wiw.errors import FileError
+
+    if not out.absolute().parent.is_dir() or out.is_dir():
+        raise FileError(f"{out}: cannot be written; choose a file in a folder that exists by --out")
+
+
+def to_percent(share: float | None) -> str:
+    """Return a share as text, "-" where there is none."""
+    return "-" if share is None else f"{100 * share:.1f} %"
