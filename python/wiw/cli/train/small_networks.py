@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Options and checks that the small networks share: they train in one process, on the CPU, into one file."""
+"""Options and checks shared by the small networks, which train in one process, on the CPU, into one file."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ from wiw.training.launcher import require_single_process
 
 VAL_SCENES = "apartments:val:20"
 Count = Annotated[int | None, arg(metavar="N", help_behavior_hint="")]
-"""A number that the recipe has where it is not given."""
+"""A number for which the recipe has a default."""
 
 
 def drop_none(options: Mapping[str, Any]) -> dict[str, Any]:
@@ -49,9 +49,9 @@ class Preparation:
     """
 
     workers: Annotated[int, arg(metavar="N")] = 2
-    """Processes that prepare the training data."""
+    """Number of processes that prepare the training data."""
     cache: Annotated[Path | None, arg(metavar="DIR", help_behavior_hint="")] = None
-    """Folder of prepared training data; it can be deleted at any time. Default: $WIW_CACHE/looks."""
+    """Folder for prepared training data, which can be deleted at any time. Default: $WIW_CACHE/looks."""
 
     def __post_init__(self) -> None:
         check_counts(workers=self.workers)
@@ -78,7 +78,7 @@ class Limits:
     """
 
     minutes: Annotated[float | None, arg(metavar="MIN")] = None
-    """Train fewer epochs if all of them would take longer than this."""
+    """Time limit in minutes: train fewer epochs if all of them would take longer."""
     seed: Annotated[int, arg(metavar="N")] = 0
     """Seed of the training data and of the weights."""
 
@@ -92,7 +92,7 @@ NO_LIMITS, PREPARATION = Limits(), Preparation()
 
 
 def check_scenes(scenes: str, val: str) -> None:
-    """Check that no scene is both trained and evaluated on, whatever its path or the edits of an apartment."""
+    """Check that no scene is used for both training and evaluation, whatever its path or an apartment's edits."""
     from wiw.scenes import absolute, resolve, strip_edits
 
     trained = {strip_edits(absolute(name)) for name in resolve(scenes)}
@@ -108,8 +108,8 @@ def write_weights(name: str, out: Path) -> Iterator[None]:
     """Train one network into a file: check that this can be done first, and report the file's size at the end.
 
     Raises:
-        ArgumentError: there are several processes, each of which would train alike and write the same file.
-        FileError: the file could not be written, which is found out before the minutes that training takes.
+        ArgumentError: there are several processes, which would all train the same way and write the same file.
+        FileError: the file cannot be written, which is checked before spending minutes on training.
     """
     require_single_process(name, "run the command without torchrun")
     _check_out(out)
@@ -122,9 +122,9 @@ def _check_out(out: Path) -> None:
     from wiw.errors import FileError
 
     if not out.absolute().parent.is_dir() or out.is_dir():
-        raise FileError(f"{out}: cannot be written; choose a file in a folder that exists by --out")
+        raise FileError(f"{out}: cannot be written; choose a file in an existing folder with --out")
 
 
 def to_percent(share: float | None) -> str:
-    """Return a share as text, "-" where there is none."""
+    """Return a share as text, "-" if there is none."""
     return "-" if share is None else f"{100 * share:.1f} %"
