@@ -90,24 +90,24 @@ def explain_hub_error(error: BaseException, name: str, revision: str | None) -> 
 
     chain = list(_walk_causes(error))
 
-    def met(*kinds: type[BaseException]) -> bool:
+    def is_caused_by(*kinds: type[BaseException]) -> bool:
         return any(isinstance(link, kinds) for link in chain)
 
     by_hand = f"or download it elsewhere (hf download {name} --local-dir FOLDER) and give weights=FOLDER"
-    if met(errors.GatedRepoError):
+    if is_caused_by(errors.GatedRepoError):
         text = f"'{name}' is gated: accept its terms at https://huggingface.co/{name}, then `hf auth login`"
         return WeightsError(text, "gated")
-    if met(errors.RevisionNotFoundError):
+    if is_caused_by(errors.RevisionNotFoundError):
         text = f"'{name}' has no revision '{revision}'; https://huggingface.co/{name}/commits/main lists its commits"
         return WeightsError(text, "revision")
-    if met(errors.RepositoryNotFoundError):
+    if is_caused_by(errors.RepositoryNotFoundError):
         text = (
             f"the hub has no repository '{name}', or it is private: check the name, or log in with `hf auth login`; "
             "weights= also accepts a folder"
         )
         return WeightsError(text, "missing")
     unreachable = any(kind.__name__ in NETWORK_ERRORS for link in chain for kind in type(link).__mro__)
-    if unreachable or met(errors.OfflineModeIsEnabled, errors.LocalEntryNotFoundError):
+    if unreachable or is_caused_by(errors.OfflineModeIsEnabled, errors.LocalEntryNotFoundError):
         text = (
             f"'{name}' is not on this machine and the hub cannot be reached: connect (unset HF_HUB_OFFLINE), {by_hand}"
         )

@@ -158,7 +158,7 @@ def map_batches(
         logging.getLogger("ray.data").setLevel(logging.ERROR)
         pool = ray_data.ActorPoolStrategy(size=workers)
         found = ray_data.from_items([dict(row) for row in rows], override_num_blocks=workers).map_batches(
-            _Called,
+            _ActorObject,
             fn_constructor_kwargs={"kind": kind, "arguments": dict(arguments), "folder": str(Path.cwd())},
             batch_size=batch,
             compute=pool,
@@ -174,7 +174,7 @@ def map_batches(
             raise _find_cause(error) from error
 
 
-class _Called:
+class _ActorObject:
     """An object in an actor of Ray Data, in the folder of whoever asks it."""
 
     def __init__(self, kind: type, arguments: Mapping[str, Any], folder: str) -> None:

@@ -146,7 +146,7 @@ class _Plan:
     def scenes_for(self, difference: float) -> tuple[int, tuple[float, float]]:
         """Return the fewest scenes, and their power by interval and by test."""
         rng = self._rng()
-        scenes = self._fewest(difference)
+        scenes = self._find_fewest_scenes(difference)
         while (shares := self._simulate(difference, scenes, rng))[0] < self.chance:
             scenes += max(1, scenes // 25)
         return scenes, shares
@@ -155,19 +155,19 @@ class _Plan:
         """Return the least difference up to `most`, to a tenth of a point, and its power."""
 
         @cache
-        def shown(tenths: int) -> tuple[float, float]:
+        def simulate_difference(tenths: int) -> tuple[float, float]:
             return self._simulate(tenths / 10, scenes, self._rng())
 
         least, end = 1, int(10 * most + 1e-9)
-        if end < least or shown(end)[0] < self.chance:
+        if end < least or simulate_difference(end)[0] < self.chance:
             raise ArgumentError(
                 f"power: {scenes * self.per_scene} episodes in {scenes} scenes cannot show a difference of up to "
                 f"{most:g} points with a chance of {100 * self.chance:g} %; take more scenes"
             )
         while least < end:
             middle = (least + end) // 2
-            least, end = (least, middle) if shown(middle)[0] >= self.chance else (middle + 1, end)
-        return end / 10, shown(end)
+            least, end = (least, middle) if simulate_difference(middle)[0] >= self.chance else (middle + 1, end)
+        return end / 10, simulate_difference(end)
 
     def _rng(self) -> np.random.Generator:
         return np.random.Generator(np.random.Philox(key=self.seed))
@@ -176,10 +176,10 @@ class _Plan:
         lost, won = self.losses / 100, (self.losses + difference) / 100
         return simulate_power(won, lost, scenes, self.per_scene, self.correlation, self.confidence, rng)
 
-    def _fewest(self, difference: float) -> int:
+    def _find_fewest_scenes(self, difference: float) -> int:
         """Return the fewest scenes by the formula."""
         least, most = 2, 2
-        while not self._enough(difference, most):
+        while not self._has_enough_power(difference, most):
             if most > MOST_SCENES:
                 raise ArgumentError(
                     f"power: a difference of {difference:g} points needs more than {MOST_SCENES} scenes"
@@ -187,10 +187,10 @@ class _Plan:
             least, most = most, 2 * most
         while least < most:
             middle = (least + most) // 2
-            least, most = (least, middle) if self._enough(difference, middle) else (middle + 1, most)
+            least, most = (least, middle) if self._has_enough_power(difference, middle) else (middle + 1, most)
         return most
 
-    def _enough(self, difference: float, scenes: int) -> bool:
+    def _has_enough_power(self, difference: float, scenes: int) -> bool:
         """Return whether scenes show a difference often enough, by the noncentral t distribution."""
         gain, discordant = difference / 100, (2 * self.losses + difference) / 100
         spread = (discordant - gain**2) * (1 + (self.per_scene - 1) * self.correlation) / self.per_scene

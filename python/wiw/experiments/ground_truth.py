@@ -70,7 +70,7 @@ class TruePlans(_Guided):
         """Propose the true plan before the policy's own, at most `candidates` in all."""
         proposals = super().propose(situations, candidates, horizon)
         return [
-            _put_first(self._guide(situation.key).suggest_plan(horizon), plans, candidates)
+            _prepend_plan(self._guide(situation.key).suggest_plan(horizon), plans, candidates)
             for situation, plans in zip(situations, proposals, strict=True)
         ]
 
@@ -119,7 +119,7 @@ class TrueScores(_Guided):
         return length if self._config is None else self._config.count_executed(length)
 
 
-def _put_first(actions: NDArray[Any], plans: Sequence[Proposal], candidates: int) -> list[Proposal]:
+def _prepend_plan(actions: NDArray[Any], plans: Sequence[Proposal], candidates: int) -> list[Proposal]:
     best = Proposal(actions, max(plan.prior for plan in plans), "true")
     others = [plan for plan in plans if not np.array_equal(plan.actions, actions)]
     return [best, *others][:candidates]

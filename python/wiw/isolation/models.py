@@ -21,7 +21,7 @@ from numpy.typing import NDArray
 from wiw.errors import ArgumentError, RegistryError
 from wiw.isolation.child import Host
 from wiw.isolation.failures import ExitError, RaisedError
-from wiw.isolation.source import Isolated, Source, build_signature, read_file_state, tell_class
+from wiw.isolation.source import Isolated, Source, build_signature, describe_class, read_file_state
 from wiw.json_text import parse_json
 from wiw.registry import WORLD_MODELS
 from wiw.types import Conditioning, Control
@@ -183,7 +183,7 @@ def load_model(host: Host, name: str) -> dict[str, Any]:
     host.make = partial(WORLD_MODELS.make_here, name)
     declared, requires = getattr(thing, "accepts", None), getattr(thing, "requires", Requirements())
     return {
-        **tell_class(thing),
+        **describe_class(thing),
         "version": str(getattr(thing, "version", "")),
         "accepts": declaration(declared) if isinstance(declared, Accepts) else "",
         "packages": list(requires.packages),

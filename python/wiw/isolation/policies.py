@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 
 from wiw.errors import ContractError, RegistryError
 from wiw.isolation.child import Host
-from wiw.isolation.source import Isolated, Source, build_signature, read_file_state, tell_class
+from wiw.isolation.source import Isolated, Source, build_signature, describe_class, read_file_state
 from wiw.json_text import parse_json
 from wiw.policies.base import FrameSpec, Policy, Situation
 from wiw.registry import POLICIES
@@ -231,7 +231,7 @@ def load_policy(host: Host, name: str) -> dict[str, Any]:
     """Import the class or factory behind a name; return what it tells before it is called."""
     host.thing = POLICIES.find_here(name)
     host.make = partial(POLICIES.make_here, name)
-    return {**tell_class(host.thing), **_declare(host.thing)}
+    return {**describe_class(host.thing), **_declare(host.thing)}
 
 
 def _declare(thing: Any) -> dict[str, Any]:
@@ -278,34 +278,34 @@ def observe(host: Host, situations: Sequence[Situation]) -> None:
 
 def propose(host: Host, situations: Sequence[Situation], candidates: int, horizon: int) -> Any:
     """Return the policy's plans as plain values."""
-    return _tell_plans(host.made.propose(_show_memories(host, situations), candidates, horizon))
+    return _pack_plans(host.made.propose(_show_memories(host, situations), candidates, horizon))
 
 
 def extend(host: Host, situations: Sequence[Situation], candidates: int, horizon: int) -> Any:
     """Return the policy's continuations as plain values."""
-    return _tell_plans(host.made.extend(_show_memories(host, situations), candidates, horizon))
+    return _pack_plans(host.made.extend(_show_memories(host, situations), candidates, horizon))
 
 
 def score(host: Host, situations: Sequence[Situation], proposals: Any, rollouts: Any) -> Any:
     """Return the policy's scores."""
-    return [_tell_array(each) for each in host.made.score(_show_memories(host, situations), proposals, rollouts)]
+    return [_pack_values(each) for each in host.made.score(_show_memories(host, situations), proposals, rollouts)]
 
 
 def revise(host: Host, situation: Situation, proposals: Any, scores: Any) -> Any:
     """Return the plan that the policy decides on, and its number."""
     actions, chosen = host.made.revise(_show_memories(host, [situation])[0], proposals, scores)
-    return _tell_array(actions), None if chosen is None else int(chosen)
+    return _pack_values(actions), None if chosen is None else int(chosen)
 
 
 def answer(host: Host, situations: Sequence[Situation], proposals: Any, rollouts: Any) -> Any:
     """Return what the policy believes."""
-    return [_tell_answer(each) for each in host.made.answer(_show_memories(host, situations), proposals, rollouts)]
+    return [_pack_answer(each) for each in host.made.answer(_show_memories(host, situations), proposals, rollouts)]
 
 
 def draw(host: Host, situation: Situation, decision: Decision, north: float) -> Any:
     """Return the policy's pictures."""
     found = host.made.draw(_show_memories(host, [situation])[0], decision, north)
-    return {name: _tell_array(picture) for name, picture in found.items()}
+    return {name: _pack_values(picture) for name, picture in found.items()}
 
 
 def list_exchanges(host: Host, key: Key) -> str:
@@ -320,20 +320,20 @@ def _show_memories(host: Host, situations: Sequence[Situation]) -> list[Situatio
     return [replace(each, memory=host.memories[each.memory]) for each in situations]
 
 
-def _tell_plans(plans: Any) -> Any:
+def _pack_plans(plans: Any) -> Any:
     if not isinstance(plans, Sequence) or not all(isinstance(each, Proposal) for own in plans for each in own):
         raise ContractError(f"propose: expected a list of wiw.types.Proposal for each episode, got {plans!r:.200}")
-    return [[(_tell_array(each.actions), float(each.prior), each.note, each.text) for each in own] for own in plans]
+    return [[(_pack_values(each.actions), float(each.prior), each.note, each.text) for each in own] for own in plans]
 
 
-def _tell_array(array: Any) -> Any:
+def _pack_values(array: Any) -> Any:
     return pack_array(np.asarray(array))
 
 
-def _tell_answer(believed: Answer | TextAnswer | None) -> Any:
+def _pack_answer(believed: Answer | TextAnswer | None) -> Any:
     if believed is None:
         return None
     if isinstance(believed, TextAnswer):
         return {"text": believed.text, "confidence": float(believed.confidence), "final": bool(believed.final)}
-    raw = None if believed.raw is None else _tell_array(believed.raw)
-    return {"choices": list(believed.choices), "probabilities": _tell_array(believed.probabilities), "raw": raw}
+    raw = None if believed.raw is None else _pack_values(believed.raw)
+    return {"choices": list(believed.choices), "probabilities": _pack_values(believed.probabilities), "raw": raw}

@@ -161,18 +161,20 @@ def read_file_state(name: str) -> tuple[str, int, int] | None:
     return str(path.resolve()), status.st_mtime_ns, status.st_size
 
 
-def tell_class(thing: Any) -> dict[str, Any]:
+def describe_class(thing: Any) -> dict[str, Any]:
     """Return what a class or factory tells of itself before it is called."""
     makes = inspect.isclass(thing) or inspect.isroutine(thing) or isinstance(thing, partial)
     return {
         "name": str(getattr(thing, "__name__", type(thing).__name__)),
         "module": str(getattr(thing, "__module__", "")),
         "doc": inspect.getdoc(thing) or "",
-        "parameters": [_tell_parameter(each) for each in inspect.signature(thing).parameters.values()] if makes else [],
+        "parameters": [_describe_parameter(each) for each in inspect.signature(thing).parameters.values()]
+        if makes
+        else [],
     }
 
 
-def _tell_parameter(parameter: inspect.Parameter) -> dict[str, Any]:
+def _describe_parameter(parameter: inspect.Parameter) -> dict[str, Any]:
     empty = inspect.Parameter.empty
     annotation = "" if parameter.annotation is empty else inspect.formatannotation(parameter.annotation).strip("'")
     value = parameter.default
@@ -205,10 +207,10 @@ def build_signature(parameters: Sequence[Mapping[str, Any]], own: Mapping[str, t
 def _read_default(told: Any) -> Any:
     if told is None:
         return inspect.Parameter.empty
-    return _Hidden(told["repr"]) if "repr" in told else told["value"]
+    return _HiddenDefault(told["repr"]) if "repr" in told else told["value"]
 
 
-class _Hidden:
+class _HiddenDefault:
     """A default value that the class keeps to itself."""
 
     def __init__(self, text: str) -> None:

@@ -130,7 +130,7 @@ def read_polarity(text: str, question: str = "") -> bool | None:
     """
     words = split_words(text)
     explicit = [word for word in words if word in _YES or word in _NO]
-    if not words or _UNSURE & set(words) or _says_both(words):
+    if not words or _UNSURE & set(words) or _says_yes_and_no(words):
         return None
     if words[0] in _YES | _NO:
         negated = words[1:2] == ["not"] and words[0] in _YES  # "certainly not"
@@ -141,7 +141,7 @@ def read_polarity(text: str, question: str = "") -> bool | None:
     return _compare_statement(text, question, negated)
 
 
-def _says_both(words: Sequence[str]) -> bool:
+def _says_yes_and_no(words: Sequence[str]) -> bool:
     """Return whether an answer begins with yes and no."""
     first = [word for word in words[:3] if word not in ("and", "or")][:2]
     return (

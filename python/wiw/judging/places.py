@@ -129,7 +129,7 @@ def _fit_parts(wanted: Sequence[Part], said: Sequence[Part], spare: int) -> Fit:
 
 
 def _fit_part(wanted: Part, said: Part) -> Fit:
-    relation = load_vocabulary().relate(wanted.concept, said.concept)
+    relation = load_vocabulary().find_relation(wanted.concept, said.concept)
     if relation >= Relation.BROADER:
         if _contradict(wanted, said):
             return Fit.CATEGORY
@@ -139,7 +139,7 @@ def _fit_part(wanted: Part, said: Part) -> Fit:
 
 def _contradict(one: Part, other: Part) -> bool:
     """Return whether two mentions are of different things or of opposite sides of one."""
-    relate = load_vocabulary().relate
-    colors = one.colors and other.colors and not any(relate(a, b) for a in one.colors for b in other.colors)
+    find_relation = load_vocabulary().find_relation
+    colors = one.colors and other.colors and not any(find_relation(a, b) for a in one.colors for b in other.colors)
     numbers = one.number and other.number and one.number != other.number
     return bool(colors or numbers or frozenset((one.side, other.side)) in _CONTRADICTIONS)

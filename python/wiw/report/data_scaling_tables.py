@@ -98,9 +98,11 @@ def list_splits(table: ScalingTable) -> list[tuple[str, list[str]]]:
 
 def explain(table: ScalingTable) -> list[str]:
     """Return what the study says, in sentences: the verdicts, fewer scenes, references, and how little it is."""
-    lines = [_tell_split(each) for each in table.splits]
+    lines = [_describe_split(each) for each in table.splits]
     lines += [
-        _tell_scenes(table.find_curve(model, FEWER_SCENES, name)) for model in table.models for name in table.primary
+        _describe_scene_gain(table.find_curve(model, FEWER_SCENES, name))
+        for model in table.models
+        for name in table.primary
     ]
     lines += [
         f"For comparison, {name}: " + ", ".join(f"{measure} {value:.3g}" for measure, value in values.items()) + "."
@@ -172,7 +174,7 @@ def _show_split(found: ModelSplit) -> list[str]:
     return [*parts, share, split.verdict]
 
 
-def _tell_split(found: ModelSplit) -> str:
+def _describe_split(found: ModelSplit) -> str:
     split, form = found.split, _choose_form(found.split.total.value)
     who = f"{found.model}, {found.measure}"
     if split.verdict == "no gain":
@@ -183,7 +185,7 @@ def _tell_split(found: ModelSplit) -> str:
     )
 
 
-def _tell_scenes(curve: Curve) -> str:
+def _describe_scene_gain(curve: Curve) -> str:
     form = _choose_form(curve.gain.value)
     verdict = "" if curve.gain.excludes_zero else ", which may be chance"
     few, whole = curve.arm.amounts[0], curve.arm.amounts[-1]

@@ -83,9 +83,9 @@ def explain(table: ErrorTable) -> list[str]:
         sure = "" if gain.p_value <= LEVEL else ", which may be chance: little can be lost where little was gained"
         found.append(f"True futures gain {show_estimate(gain.estimate, signed=True)} points over none{sure}.")
     costs = [each for each in table.costs if each.measure == table.distance]
-    found += [_tell_cost(each, table.label) for each in costs]
-    found += [_tell_gap(each) for each in table.gaps if each.measure == table.distance]
-    found += [_tell_cost(each, table.label) for each in table.costs if each.measure == METRES]
+    found += [_describe_cost(each, table.label) for each in costs]
+    found += [_describe_gap(each) for each in table.gaps if each.measure == table.distance]
+    found += [_describe_cost(each, table.label) for each in table.costs if each.measure == METRES]
     if lost := [line for line in table.lines if _is_loss(line)]:
         found.append(
             "Significantly below the oracle, adjusted for all arms: " + ", ".join(line.arm for line in lost) + "."
@@ -157,7 +157,7 @@ def _is_loss(line: ErrorLine) -> bool:
     return line.loss.is_shown and line.loss.estimate.value < 0
 
 
-def _tell_cost(found: Cost, label: str) -> str:
+def _describe_cost(found: Cost, label: str) -> str:
     sure = "" if found.loss.excludes_zero else ", which may be chance"
     return (
         f"Errors of {found.family} cost {show_estimate(found.loss)} points of {label} per {_name_step(found.measure)} "
@@ -165,7 +165,7 @@ def _tell_cost(found: Cost, label: str) -> str:
     )
 
 
-def _tell_gap(found: CostGap) -> str:
+def _describe_gap(found: CostGap) -> str:
     if not found.loss.excludes_zero:
         verdict = "undecided"
     else:

@@ -173,7 +173,7 @@ class _ActorPool:
         if not ready and not any(lease.job for lease in self._leases):
             raise InfrastructureError(self._describe_shortage(serves))
         for pool in (self._models, self._vlms):
-            pool.tend(ready)
+            pool.update_servers(ready)
         for lease in [lease for lease in self._leases if lease.rows in ready]:
             self._receive(lease)
 

@@ -144,15 +144,15 @@ class ServerPool:
 
     @property
     def refs(self) -> list[Any]:
-        """References to wait for: one that is ready is news of a server, which `tend` deals with."""
+        """References to wait for: one that is ready is news of a server, which `update_servers` deals with."""
         return [server.ref for server in self._servers]
 
     def start(self) -> None:
-        """Start all servers, at the same time; `tend` tells when they serve."""
+        """Start all servers, at the same time; `update_servers` tells when they serve."""
         for server in self._servers:
             self._start(server)
 
-    def tend(self, ready: Sequence[Any]) -> None:
+    def update_servers(self, ready: Sequence[Any]) -> None:
         """Deal with servers that have begun to serve, or are lost.
 
         Raises:

@@ -116,7 +116,7 @@ class RunStore:
             copy.discard()
         store = cls(path, connect(path, lock), lock, copy)
         with store._close_on_error():
-            store._fill(created or _now(), config, info, episodes)
+            store._fill(created or _format_now(), config, info, episodes)
         return store
 
     def _fill(self, created: str, config: dict[str, Any], info: dict[str, Any], episodes: Iterable[Episode]) -> None:
@@ -172,7 +172,7 @@ class RunStore:
         """
         path = store_path(run)
         if scratch is not None and path.exists():
-            store = cls._take_in(ScratchCopy(path, Path(scratch)))
+            store = cls._open_scratch_copy(ScratchCopy(path, Path(scratch)))
         else:
             store = cls._open(path, lock_store(path) if path.exists() else None)
         with store._close_on_error():
@@ -247,11 +247,11 @@ class RunStore:
         return cls._open(path, lock_store(path) if path.exists() else None)
 
     @classmethod
-    def _take_in(cls, copy: ScratchCopy) -> RunStore:
+    def _open_scratch_copy(cls, copy: ScratchCopy) -> RunStore:
         """Open a store for writing on a local disk."""
         lock = lock_both(copy)
         try:
-            copy.take_in()
+            copy.fetch_store()
         except BaseException:
             lock.close()
             raise
@@ -324,7 +324,7 @@ class RunStore:
     @property
     def wiw_version(self) -> str:
         """Version of wiw that began the run."""
-        return str(self._value("wiw_version"))
+        return str(self._read_column("wiw_version"))
 
     @property
     def benchmark(self) -> int:
@@ -334,17 +334,17 @@ class RunStore:
     @property
     def created(self) -> str:
         """When the run began, ISO 8601 in UTC."""
-        return str(self._value("created"))
+        return str(self._read_column("created"))
 
     @property
     def config(self) -> dict[str, Any]:
         """Task, arms and seed."""
-        return dict(parse_column("config", self._value("config"), str(self.path)))
+        return dict(parse_column("config", self._read_column("config"), str(self.path)))
 
     @property
     def info(self) -> dict[str, Any]:
         """Platform, how to rebuild task and agents, which episodes keep pictures."""
-        return dict(parse_column("info", self._value("info"), str(self.path)))
+        return dict(parse_column("info", self._read_column("info"), str(self.path)))
 
     @property
     def salt(self) -> str:
@@ -564,7 +564,8 @@ class RunStore:
         """Store a judge's description, so that its marks can be written."""
         with self._writing() as connection:
             connection.execute(
-                "INSERT OR IGNORE INTO judge VALUES (?, ?, ?)", (judge.digest, to_json(dict(judge.description)), _now())
+                "INSERT OR IGNORE INTO judge VALUES (?, ?, ?)",
+                (judge.digest, to_json(dict(judge.description)), _format_now()),
             )
 
     def write_judged(self, row: JudgedRow) -> None:
@@ -604,7 +605,7 @@ class RunStore:
             info: what it says of all arms: "agents", "sources" and "departures".
         """
         known = {arm["name"] for arm in self.config["arms"]}
-        added = {"time": _now(), "arms": [arm["name"] for arm in config["arms"] if arm["name"] not in known]}
+        added = {"time": _format_now(), "arms": [arm["name"] for arm in config["arms"] if arm["name"] not in known]}
         log = [*self.info.get("arms_added", []), added]
         with self._writing() as connection:
             connection.execute(
@@ -617,7 +618,7 @@ class RunStore:
         info = self.info
         old = info.get("sources", {})
         changed = sorted(path for path in old.keys() | sources.keys() if old.get(path) != sources.get(path))
-        log = [*info.get("sources_changed", []), {"time": _now(), "files": changed}]
+        log = [*info.get("sources_changed", []), {"time": _format_now(), "files": changed}]
         with self._writing() as connection:
             connection.execute(
                 "UPDATE run SET info = ?", (to_json({**info, "sources": dict(sources), "sources_changed": log}),)
@@ -632,7 +633,7 @@ class RunStore:
             return
         info["live"] = changed.get("live", info["live"])
         info["limits"] |= {name: value for name, value in changed.items() if name != "live"}
-        info["resumed_with"] = [*info.get("resumed_with", []), {"time": _now(), **changed}]
+        info["resumed_with"] = [*info.get("resumed_with", []), {"time": _format_now(), **changed}]
         with self._writing() as connection:
             connection.execute("UPDATE run SET info = ?", (to_json(info),))
 
@@ -644,7 +645,7 @@ class RunStore:
 
     def begin_session(self) -> None:
         """Store when and where episodes begin to be run, and how many have ended before, for `wiw status`."""
-        session = {"begun": _now(), "ended": self.count_ended()[0], **describe_process()}
+        session = {"begun": _format_now(), "ended": self.count_ended()[0], **describe_process()}
         with self._writing() as connection:
             connection.execute("UPDATE run SET info = ?", (to_json({**self.info, "session": session}),))
         if self._copy is not None:
@@ -797,7 +798,7 @@ class RunStore:
         names = ", ".join(f"{name} {row[name]}" for name in ("arm", "episode", "decision") if name in row)
         return f"{self.path}: {table} ({names})"
 
-    def _value(self, column: str) -> Any:
+    def _read_column(self, column: str) -> Any:
         rows = self._rows("SELECT * FROM run")
         if not rows:
             raise StoreError(f"{self.path} is damaged: it does not say which run it holds")
@@ -828,7 +829,7 @@ def leave_resumable(begun: RunStore) -> Iterator[None]:
         raise
 
 
-def _now() -> str:
+def _format_now() -> str:
     """Return the time, ISO 8601 in UTC."""
     return datetime.now(timezone.utc).isoformat(timespec="seconds")
 

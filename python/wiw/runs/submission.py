@@ -122,7 +122,7 @@ class JobCommand:
             InfrastructureError: it ended with another exit code than `FINISHED`.
         """
         process = self._process = subprocess.Popen([sys.executable, "-m", "wiw.cli", *self.arguments])
-        signal.signal(signal.SIGTERM, self._pass_on)
+        signal.signal(signal.SIGTERM, self._forward_signal)
         while (code := process.poll()) is None:  # wait() holds a lock that `checkpoint` would wait for
             time.sleep(0.1)
         if code not in FINISHED:
@@ -146,7 +146,7 @@ class JobCommand:
     def __str__(self) -> str:
         return shlex.join(["wiw", *self.arguments])
 
-    def _pass_on(self, number: int, frame: FrameType | None) -> None:
+    def _forward_signal(self, number: int, frame: FrameType | None) -> None:
         if self._process is not None:
             with suppress(ProcessLookupError):
                 os.kill(self._process.pid, number)

@@ -120,7 +120,7 @@ def _run_again(store: RunStore, keys: set[tuple[str, int]]) -> dict[tuple[str, i
         if indices:
             collected = _Collected()
             runner.run(Job(arm, tuple((index, all_episodes[index]) for index in indices)), collected)
-            found |= {(arm, index): collected.facts(index) for index in indices}
+            found |= {(arm, index): collected.list_facts(index) for index in indices}
     return found
 
 
@@ -148,7 +148,7 @@ class _Collected:
                 _describe_outcome(row.result.status, row.result.metrics, row.result.error)
             )
 
-    def facts(self, index: int) -> Facts:
+    def list_facts(self, index: int) -> Facts:
         return [*self._agent, *self._get_facts(index)]
 
     def _get_facts(self, index: int) -> Facts:

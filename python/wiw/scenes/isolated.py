@@ -60,9 +60,9 @@ def read_in_child(module: str, job: dict[str, Any]) -> dict[str, Any]:
             env=make_child_environment(),
         )
     except subprocess.TimeoutExpired:
-        raise _out_of_time(path) from None
+        raise _build_timeout_error(path) from None
     if child.returncode in (-signal.SIGALRM, -signal.SIGXCPU):
-        raise _out_of_time(path)
+        raise _build_timeout_error(path)
     if child.returncode < 0:
         name = signal.Signals(-child.returncode).name
         raise FileError(
@@ -86,5 +86,5 @@ def _reply(path: str, child: subprocess.CompletedProcess[bytes]) -> dict[str, An
     return reply
 
 
-def _out_of_time(path: str) -> FileError:
+def _build_timeout_error(path: str) -> FileError:
     return FileError(f"{path}: importing took more than {TIMEOUT:.0f} s and was aborted (damaged file?)")

@@ -103,7 +103,7 @@ class VlmServer:
 
     def complete(self, body: dict[str, Any]) -> Completion:
         """Return the completion that a request asks for."""
-        call = call_of(body)
+        call = parse_call(body)
         with self._asking:
             (completion,) = self.client.complete([call])
         return completion
@@ -188,7 +188,7 @@ class _Handler(BaseHTTPRequestHandler):
             self.close_connection = True
 
 
-def call_of(body: Mapping[str, Any]) -> Call:
+def parse_call(body: Mapping[str, Any]) -> Call:
     """Return the call that a request asks for.
 
     Raises:

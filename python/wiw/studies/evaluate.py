@@ -188,7 +188,7 @@ def _run(task: Any, agents: Mapping[str, Any], settings: RunConfig, more_arms: b
         begun_with = [arm["name"] for arm in store.config["arms"]]
         require_left(built, store, agents)
         update_own_sources(store, task, {arm: agents[arm] for arm in begun_with})
-        _take_over(store, settings)
+        _apply_settings(store, settings)
         if len(agents) > len(begun_with):
             _add_arms(store, config, _describe_agents(task, agents, built, count))
     else:
@@ -262,7 +262,7 @@ def _add_arms(store: RunStore, config: dict[str, Any], info: Mapping[str, Any]) 
     store.add_arms(config, info)
 
 
-def _take_over(store: RunStore, settings: RunConfig) -> None:
+def _apply_settings(store: RunStore, settings: RunConfig) -> None:
     """Let a resumed run go on with these settings; closes the store where other things would be measured.
 
     Raises:

@@ -87,14 +87,14 @@ def judge(
     folder = run.path if isinstance(run, RunLog) else Path(run)
     made = make_judge(judge, **options)
     with RunStore.annotate(folder) as store:
-        marking = _Marking(store, made)
+        marking = _JudgingPass(store, made)
         marking.mark_missing(progress)
         missing = tuple(marking.list_missing())
     log = load_run(folder, judge=marking.judge.digest)
     return JudgedRun(log, marking.judge, marking.asked, marking.known_before, missing, marking.stopped)
 
 
-class _Marking:
+class _JudgingPass:
     """The answers of a run on their way through a judge."""
 
     def __init__(self, store: RunStore, made: Judge) -> None:

@@ -146,7 +146,7 @@ def run_processes(arguments: Sequence[str], layout: ProcessLayout) -> int:
 
     os.environ |= {key: os.environ.get(key, value) for key, value in _list_settings(layout).items()}
     stopped, code = 0, 0
-    with _lend_signals():
+    with _release_signals():
         try:
             run.run(run.parse_args([*list_options(layout, "localhost", "wiw"), *_list_module(arguments)]))
         except ChildFailedError as error:
@@ -159,7 +159,7 @@ def run_processes(arguments: Sequence[str], layout: ProcessLayout) -> int:
 
 
 @contextmanager
-def _lend_signals() -> Iterator[None]:
+def _release_signals() -> Iterator[None]:
     """Let torchrun handle signals, as long as the context lasts."""
     numbers = (signal.SIGTERM, signal.SIGINT, signal.SIGHUP, signal.SIGQUIT)
     earlier = {number: signal.getsignal(number) for number in numbers}

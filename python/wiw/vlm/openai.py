@@ -89,7 +89,7 @@ class OpenAIClient(Client):
         self._given |= {"timeout": timeout, "attempts": attempts, "image_format": image_format, **options}
 
     def __reduce__(self) -> Any:
-        return _remade, (self.base_url, self._given)
+        return _rebuild_client, (self.base_url, self._given)
 
     @property
     def model(self) -> str:
@@ -181,7 +181,7 @@ class OpenAIClient(Client):
         until = time.monotonic() + self.timeout
         data = bytearray()
         with self._sdk.chat.completions.with_streaming_response.create(**body) as response:
-            for piece in _pieces(response):
+            for piece in _iterate_body(response):
                 data += piece
                 if len(data) > MOST_BYTES:
                     return Completion(data[:1000].decode("utf-8", "replace"), "huge")
@@ -200,27 +200,27 @@ class OpenAIClient(Client):
         retries = retries or _Retries()
         while True:
             try:
-                return _within(self.timeout, work)
+                return _run_within(self.timeout, work)
             except openai.APIStatusError as error:
                 passing = error.status_code in _PASSING or error.status_code >= 500
                 said, kind, wait = (
-                    f"{error.status_code} {_short(error)}",
+                    f"{error.status_code} {_shorten(error)}",
                     "status" if passing else "refused",
                     _read_retry_after(error),
                 )
             except (openai.APITimeoutError, TimeoutError) as error:
                 passing, said, kind, wait = (
                     True,
-                    _short(error) or f"no answer within {self.timeout:g} s",
+                    _shorten(error) or f"no answer within {self.timeout:g} s",
                     "timeout",
                     None,
                 )
             except _NoCompletionError as error:
-                passing, said, kind, wait = True, _short(error), "protocol", None
+                passing, said, kind, wait = True, _shorten(error), "protocol", None
             except _BrokenOffError as error:
-                passing, said, kind, wait = True, _short(error), "unreachable", None
+                passing, said, kind, wait = True, _shorten(error), "unreachable", None
             except openai.APIError as error:
-                passing, said, kind, wait = True, f"{type(error).__name__}: {_short(error)}", "unreachable", None
+                passing, said, kind, wait = True, f"{type(error).__name__}: {_shorten(error)}", "unreachable", None
             if not passing or retries.count + 1 >= self.attempts:
                 times = f"{retries.count + 1} tries" if retries.count else "1 try"
                 hint = REFUSED_LOGPROBS if kind == "refused" and "logprob" in said else ""
@@ -230,7 +230,7 @@ class OpenAIClient(Client):
             retries.count += 1
 
 
-def _within(seconds: float, work: Callable[[], Any]) -> Any:
+def _run_within(seconds: float, work: Callable[[], Any]) -> Any:
     """Do the work in a separate thread, which is abandoned after `seconds`.
 
     The transport limits each read but not their sum, so headers that drip in would take any time.
@@ -271,7 +271,7 @@ class _BrokenOffError(Exception):
     """A connection that ended before the reply did."""
 
 
-def _pieces(response: Any) -> Iterator[bytes]:
+def _iterate_body(response: Any) -> Iterator[bytes]:
     """Yield the body in pieces; the transport's errors, which have private classes, become `_BrokenOffError`."""
     try:
         yield from response.iter_bytes()
@@ -299,11 +299,11 @@ def _begin(response: Any, seconds: float) -> Any:
     return Begin()
 
 
-def _remade(base_url: str, options: dict[str, Any]) -> OpenAIClient:
+def _rebuild_client(base_url: str, options: dict[str, Any]) -> OpenAIClient:
     return OpenAIClient(base_url, **options)
 
 
-def _short(error: Exception) -> str:
+def _shorten(error: Exception) -> str:
     return " ".join(str(error).split())[:300]
 
 

@@ -188,7 +188,7 @@ def blob(name: str, value: Any) -> bytes:
     return bytes(_of_type(name, value, bytes))
 
 
-def whole(name: str, value: Any) -> int:
+def read_count(name: str, value: Any) -> int:
     """Read a number from 0 to 2**64 - 1."""
     if _of_type(name, value, int) < 0:
         raise RemoteError(f"{name}: expected a number of at least 0, got {value}", "message")
@@ -205,7 +205,7 @@ def seconds(name: str, value: Any) -> float:
 READERS: Mapping[str, Reader] = {
     "str": text,
     "bytes": blob,
-    "int": whole,
+    "int": read_count,
     "float": seconds,
     "NDArray[np.uint8]": unpack_array,
 }

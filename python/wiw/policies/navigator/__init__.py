@@ -212,7 +212,7 @@ class Navigator(Policy):
             made = [make_candidate(pose, plan.actions) for plan in plans]
             for plan, future in zip(made, futures, strict=True):
                 self._remember_imagined(memory, plan, future)
-            scores.append(self._evaluate(self._look_out(memory, pose, _get_ends(made)), made))
+            scores.append(self._evaluate(self._form_outlook(memory, pose, _get_ends(made)), made))
         return scores
 
     # -- evidence ------------------------------------------------------------------------------------------------------
@@ -236,7 +236,9 @@ class Navigator(Policy):
 
     # -- plans ---------------------------------------------------------------------------------------------------------
 
-    def _look_out(self, memory: Memory, pose: NDArray[np.float64], included: NDArray[np.float64] = NOWHERE) -> _Outlook:
+    def _form_outlook(
+        self, memory: Memory, pose: NDArray[np.float64], included: NDArray[np.float64] = NOWHERE
+    ) -> _Outlook:
         """Return the belief by all evidence, and where it leads the agent, which it remembers.
 
         The map covers what is within 9 m of the start, and all evidence, the target and `included` [N, 2] beyond.
@@ -268,10 +270,10 @@ class Navigator(Policy):
 
     def _propose_one(self, situation: Situation, count: int, horizon: int) -> list[Proposal]:
         memory, pose = situation.memory, np.asarray(situation.observation.odometry, np.float64)
-        outlook = self._look_out(memory, pose)
+        outlook = self._form_outlook(memory, pose)
         plans = self._list_plans(memory, outlook, pose, horizon)
         if not outlook.way_map.cells.contain(_get_ends(plans)):  # a straight run leads off the map
-            outlook = self._look_out(memory, pose, pose[:2] + horizon * STEP * np.array([[-1, -1], [1, 1]]))
+            outlook = self._form_outlook(memory, pose, pose[:2] + horizon * STEP * np.array([[-1, -1], [1, 1]]))
             plans = self._list_plans(memory, outlook, pose, horizon)
         values = self._evaluate(outlook, plans)
         chosen = choose_apart(plans, values, count, self.options.apart)

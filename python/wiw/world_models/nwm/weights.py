@@ -63,7 +63,7 @@ def load_cdit(path: Path) -> CDiT:
         size = Architecture.of(state)
     except KeyError as error:
         raise WeightsError(
-            f"{path}: not weights of a CDiT: expected {error}; it has {_some(sorted(state))}", "unfit"
+            f"{path}: not weights of a CDiT: expected {error}; it has {_list_some(sorted(state))}", "unfit"
         ) from None
     with torch.device("meta"):
         network = CDiT(size)
@@ -97,7 +97,7 @@ def load_codec(vae: str, revision: str | None) -> Any:
             f"no AutoencoderKL in {vae} ({_first_line(error)}); `hf download {CODEC} --local-dir FOLDER` fetches one"
         ) from error
     if lacking := [name for name, value in codec.named_parameters() if value.is_meta]:
-        raise WeightsError(f"{vae} lacks {len(lacking)} parameters: {_some(lacking)}; fetch it again", "unfit")
+        raise WeightsError(f"{vae} lacks {len(lacking)} parameters: {_list_some(lacking)}; fetch it again", "unfit")
     return codec.float().eval().requires_grad_(False)
 
 
@@ -132,7 +132,7 @@ def _state(path: Path) -> dict[str, Tensor]:
         ) from error
     if not isinstance(checkpoint, dict) or not isinstance(checkpoint.get("ema"), dict):
         keys = sorted(map(str, checkpoint)) if isinstance(checkpoint, dict) else [type(checkpoint).__name__]
-        raise WeightsError(f"{path}: expected a checkpoint with the key 'ema', found {_some(keys)}", "unfit")
+        raise WeightsError(f"{path}: expected a checkpoint with the key 'ema', found {_list_some(keys)}", "unfit")
     return {name: value.clone() for name, value in checkpoint["ema"].items()}  # apart from the file
 
 
@@ -140,10 +140,10 @@ def _difference(expected: dict[str, tuple[int, ...]], found: dict[str, tuple[int
     other = [f"{n} {found[n]} for {expected[n]}" for n in sorted(expected) if found.get(n, expected[n]) != expected[n]]
     missing, unknown = sorted(expected.keys() - found.keys()), sorted(found.keys() - expected.keys())
     named = (("missing", missing), ("unknown", unknown), ("of another shape", other))
-    return "; ".join(f"{len(names)} {kind}: {_some(names)}" for kind, names in named if names)
+    return "; ".join(f"{len(names)} {kind}: {_list_some(names)}" for kind, names in named if names)
 
 
-def _some(names: list[str]) -> str:
+def _list_some(names: list[str]) -> str:
     return ", ".join(names[:5]) + (f" and {len(names) - 5} more" if len(names) > 5 else "")
 
 
