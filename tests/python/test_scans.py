@@ -519,7 +519,7 @@ def test_verify_says_what_is_wrong(tmp_path: Path, capsys: pytest.CaptureFixture
     assert main(["scenes", "verify", str(tmp_path / "all")]) == 1
     out = capsys.readouterr().out
     assert "3 scans, 2 with something wrong" in out and "info_semantic.json: not a Replica table" in out
-    assert "1 of 6 objects lie over 0.5 m from their boxes in the house file: 2" in out
+    assert "1 of 6 objects are over 0.5 m from their boxes in the house file: 2" in out
     row = next(line.split() for line in out.splitlines() if line.startswith("whole"))
     assert row[2:7] == ["2", "0.0", "6", "6", "2"]
     assert main(["scenes", "verify", f"mp3d:{tmp_path / 'all' / 'whole'}"]) == 0

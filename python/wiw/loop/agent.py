@@ -28,15 +28,15 @@ class Agent(BaseAgent):
 
     Args:
         policy: base and proposal policy (name or instance).
-        model: world model (name, class or instance), or an `Imaginer` that asks one; None runs the same loop with
-            imagination left out.
+        model: world model (name, class or instance), or an `Imaginer` that calls one; None runs the same loop without
+            imagination.
         reviser: policy that scores imagined futures; None means the policy itself, or its default reviser.
-        config: numbers of the search; what it leaves open is the task's, or the paper's ImageNav.
-        observers: measure decisions and change none.
-        numbers: any of `AgentConfig`'s, such as candidates=3 and horizon=5, in place of the config's.
+        config: parameters of the search; open ones are taken from the task, or from the paper's ImageNav.
+        observers: measure decisions without changing them.
+        numbers: parameters of `AgentConfig` that override the config's, such as candidates=3 and horizon=5.
 
     Raises:
-        ArgumentError: a number out of range; parts that do not fit each other, such as a model that takes other plans
+        ArgumentError: a number out of range; parts that do not fit together, such as a model that takes other plans
             than the policy makes.
     """
 

@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
 """Rerun some episodes of a run and compare every decision and measurement with the record.
 
-Recorded answers of a language model are replayed. Timings are left out, and so is a rollout cache, which would
-answer with what is to be checked, and LPIPS, whose last digits depend on threads and device.
+Recorded answers of a language model are replayed. Timings are not compared, nor is LPIPS, whose last digits depend on
+threads and device; the rollout cache is not used, as it would return what is to be checked.
 """
 
 from __future__ import annotations
@@ -28,15 +28,15 @@ UNLIKE = ("seconds", "calls", "spent", "arm", "episode", "decision")
 
 @dataclass(frozen=True)
 class Check:
-    """One episode of one arm, recorded and run again."""
+    """One episode of one arm, recorded and rerun."""
 
     arm: str
     episode: int
     recorded: str
-    """SHA-256 of everything that was decided and measured, as hexadecimal digits."""
+    """SHA-256 of everything that was decided and measured, in hexadecimal."""
     again: str
     difference: str
-    """What differs first, e.g. "decision 3: scores: recorded [0.25,0.5], now [0.25,0.75]"; empty where nothing does."""
+    """What differs first, e.g. "decision 3: scores: recorded [0.25,0.5], now [0.25,0.75]"; empty if nothing does."""
 
     @property
     def same(self) -> bool:
@@ -53,7 +53,7 @@ class Verification:
 
     @property
     def same(self) -> bool:
-        """Whether every episode came out as recorded."""
+        """Whether every episode is as recorded."""
         return all(check.same for check in self.checks)
 
     def __str__(self) -> str:
@@ -74,17 +74,17 @@ Facts = list[tuple[str, dict[str, Any]]]
 
 
 def verify(run: str | Path, episodes: int = 3, seed: int = 0) -> Verification:
-    """Run `episodes` random episodes of a run again, in every arm that has ended them, and compare.
+    """Rerun `episodes` random episodes of a run, in every arm that has finished them, and compare.
 
     Args:
         run: the run's folder.
         episodes: how many; all if the run has fewer.
-        seed: of the choice of episodes.
+        seed: seed of the sample of episodes.
 
     Raises:
         ArgumentError: fewer than one episode.
-        StoreError: no readable run, one of another version of the benchmark, one that was begun with objects in memory,
-            whose task or source files have changed, or without an ended episode.
+        StoreError: the run cannot be read, is of another version of the benchmark, was started with objects in memory,
+            has no finished episode, or its task or source files have changed.
         FileError: a scene is not there.
     """
     if episodes < 1:
@@ -125,7 +125,7 @@ def _run_again(store: RunStore, keys: set[tuple[str, int]]) -> dict[tuple[str, i
 
 
 class _Collected:
-    """Collects rows in memory, in place of a run store."""
+    """Collects rows in memory instead of a run store."""
 
     def __init__(self) -> None:
         self._agent: Facts = []
@@ -156,7 +156,7 @@ class _Collected:
 
 
 def read_facts(store: RunStore, outcome: Mapping[str, Any]) -> Facts:
-    """Return what was decided and measured in an ended episode, given its row of `recorded_outcomes`."""
+    """Return what was decided and measured in a finished episode, given its row of `recorded_outcomes`."""
     arm, index = outcome["arm"], outcome["episode"]
     decisions = [
         _describe_decision(row["decision"], row, store.images(arm, index, row["decision"]))
@@ -188,7 +188,7 @@ def _check(key: tuple[str, int], recorded: Facts, again: Facts) -> Check:
 
 
 def list_differences(recorded: Sequence[tuple[str, Any]], again: Sequence[tuple[str, Any]]) -> Iterator[str]:
-    """Return in words what differs between two records of an episode, first things first."""
+    """Yield in words what differs between two records of an episode, in order."""
     for (place, was), (place_now, now) in zip(recorded, again, strict=False):
         if place != place_now:
             yield f"{place}: now {place_now}, {now.get('error') or 'another number of decisions'}"

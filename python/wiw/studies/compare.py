@@ -31,12 +31,12 @@ from wiw.studies.run_log import RunLog, load_run
 from wiw.types import Episode
 
 LENGTH_TOLERANCE = 1e-3
-"""Metres by which the shortest path of an episode may differ between two machines."""
+"""Metres by which an episode's shortest path may differ between two machines."""
 
 BUDGET_RULES = ("decisions", "actions", "limit", "budget", "execute", "horizon")
-"""Rules of tasks that say how much an episode may take."""
+"""Rules of tasks that define an episode's budget."""
 MOST_NAMED = 5
-"""Differences between two agents that are listed by name."""
+"""Maximum number of differences between two agents that are listed by name."""
 
 
 @dataclass(frozen=True)
@@ -46,7 +46,7 @@ class Comparison(SummaryTable):
     runs: tuple[str, str] = ("", "")
     """Names of the runs in the table."""
     changed: tuple[str, ...] = ()
-    """Differences between the two agents of a row, a sentence each."""
+    """Differences between the two agents of a row, one sentence each."""
 
     def groups(self) -> tuple[Group, ...]:
         """Return all differences as one table."""
@@ -59,7 +59,7 @@ class Comparison(SummaryTable):
         return (Group(title, f"Gain of {second} over {first}", f"{second} minus {first}", rows),)
 
     def remarks(self) -> tuple[str, ...]:
-        """Return what both runs need to be read with, and the differences between the agents."""
+        """Return notes on how to read both runs, and the differences between the agents."""
         return (*super().remarks(), *self.changed)
 
 
@@ -74,22 +74,23 @@ def compare(
 ) -> Comparison:
     """Compare two runs on the same episodes: run b minus run a, for each arm that both have.
 
-        wiw.compare("runs/old", "runs/new")                      # every arm of both, under its name
-        wiw.compare("runs/a", "runs/b", arm="warp")              # one
+        wiw.compare("runs/old", "runs/new")                      # every arm of both runs, under its name
+        wiw.compare("runs/a", "runs/b", arm="warp")              # one arm
         wiw.compare("runs/a", "runs/b", arm="warp", other="mine")  # b's "mine" minus a's "warp"
 
     Args:
-        a: folder of a run, wherever it lies, or the run.
-        b: likewise.
-        arm: of run a (and of run b, unless `other` names another); None: all that both have, or the only one of each.
+        a: a run, or its folder.
+        b: the same for the second run.
+        arm: arm of run a (and of run b, unless `other` is given); None: all arms that both have, or the only one of
+            each.
         other: arm of run b to compare with `arm`.
         judge: name or digest of the judge whose marks are compared (see `wiw.judge`); None for each run's own, or the
             one that a run given as an object was opened with.
-        unlike_budgets: whether to compare runs whose episodes may take unlike numbers of decisions or actions; the
-            table then says what differs.
+        unlike_budgets: whether to compare runs whose episodes have different budgets of decisions or actions; the table
+            then says what differs.
 
     Raises:
-        ArgumentError: an arm that is not there, no arm in common, or a judge that has not marked a run.
+        ArgumentError: an arm that does not exist, no common arm, or a judge that has not marked a run.
         StoreError: a run cannot be read, or the two differ in task, seed, episodes or judge: the first field that
             differs.
     """
@@ -151,7 +152,7 @@ def _open(run: str | Path | RunLog, judge: str | None) -> RunLog:
 
 
 def _summarise_arms(log: RunLog, both: Summary, labels: Mapping[str, str]) -> list[ArmSummary]:
-    """Return the lines of one run's arms, with the roles that they have in it; `labels` by arm."""
+    """Return the lines of one run's arms, with their roles in it; `labels` by arm."""
     policies = [one["name"] for one in log.store.config["arms"] if one["agent"].get("model") is None]
     return [replace(both[label], role=role_of(arm, policies)) for arm, label in labels.items()]
 
@@ -170,11 +171,11 @@ def require_comparable(
     Args:
         a: run.
         b: another.
-        pairs: arms of both that are compared, whose budgets must be alike.
+        pairs: arms of both to compare, whose budgets must be equal.
         unlike_budgets: whether budgets may differ.
 
     Raises:
-        StoreError: the first field that differs, with both values and what to do; of budgets all that differ.
+        StoreError: the first field that differs, with both values and what to do; for budgets all that differ.
     """
     versions = [a.store.benchmark, b.store.benchmark]
     if versions[0] != versions[1]:
@@ -205,7 +206,7 @@ def require_comparable(
 
 
 def list_unlike_budgets(a: RunLog, b: RunLog, pairs: Sequence[tuple[str, str]]) -> list[str]:
-    """Return how the budgets of two runs differ: rules of the task, and actions that arms carry out per decision."""
+    """Return how the budgets of two runs differ: rules of the task, and actions that arms execute per decision."""
     rules = [log.store.config["task"] for log in (a, b)]
     found = [
         f"task.{name} is {to_json(rules[0].get(name))} in the first and {to_json(rules[1].get(name))} in the second"
@@ -220,7 +221,7 @@ def list_unlike_budgets(a: RunLog, b: RunLog, pairs: Sequence[tuple[str, str]]) 
 
 
 def _count_executed(log: RunLog, arm: str) -> int | None:
-    """Return the most actions that an arm carries out per decision; None for an agent that does not say."""
+    """Return the maximum number of actions that an arm executes per decision; None for an agent that does not say."""
     built = log.store.info.get("built", {}).get(arm, {})
     if not {"horizon", "execute"} <= built.keys():
         return None
@@ -229,7 +230,7 @@ def _count_executed(log: RunLog, arm: str) -> int | None:
 
 
 def _require_same_judge(a: RunLog, b: RunLog) -> None:
-    """Check that the marks of both runs are by one judge, with one model, prompt and sampling."""
+    """Check that the marks of both runs are by the same judge, with the same model, prompt and sampling."""
     judges = [log.store.judge for log in (a, b)]
     digests = [None if judge is None else judge.digest for judge in judges]
     if digests[0] != digests[1]:
@@ -290,7 +291,7 @@ def _list_pairs(a: RunLog, b: RunLog, arm: str | None, other: str | None) -> lis
 
 
 def _name_runs(a: RunLog, b: RunLog) -> tuple[str, str]:
-    """Return the shortest ends of the two paths that differ."""
+    """Return the shortest differing ends of the two paths."""
     paths = [log.path.resolve().parts for log in (a, b)]
     if paths[0] == paths[1]:
         return "first", "second"
@@ -321,7 +322,7 @@ def _describe_changes(a: RunLog, b: RunLog, pair: tuple[str, str]) -> list[str]:
 
 
 def _describe_agent(log: RunLog, arm: str, built: bool) -> dict[str, Any]:
-    """Return the agent's description, flattened: as it was built, or else as it was configured."""
+    """Return the agent's flattened description: as built, or else as configured."""
     configured = next(one["agent"] for one in log.store.config["arms"] if one["name"] == arm)
     return {**_flatten(log.store.info["built"][arm] if built else configured), "wiw": log.store.wiw_version}
 

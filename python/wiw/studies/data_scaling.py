@@ -1,9 +1,9 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Does a world model get better with data, or with updates? (paper, "Data scaling".)
+"""Does a world model improve with data, or with updates? (paper, "Data scaling".)
 
 The paper trains on 400 to 80,000 clips for one epoch each, so that more clips are also more updates. Here the sizes are
-trained for one epoch as well, for equally many updates, and on clips of fewer scenes. `data_scaling_plan` has what is
-measured and how it is judged, which is written to the study's folder before anything is trained.
+also trained for one epoch, for equally many updates, and on clips from fewer scenes. `data_scaling_plan` defines what
+is measured and how it is judged, which is written to the study's folder before anything is trained.
 """
 
 from __future__ import annotations
@@ -51,12 +51,12 @@ from wiw.training.learners import make_learner
 from wiw.training.post_training.corpora import NavigationCorpus, require_panoramas
 
 PLAN, DATA = "plan.json", "data"
-"""In a study's folder."""
+"""Names inside a study's folder."""
 MEASURING = 60
-"""Updates that take about as long as measuring a model."""
+"""Number of updates that take about as long as evaluating a model."""
 
 Watch = Callable[[str, int, int, str], None]
-"""Called with what is done, how much of it, out of how much, and a text."""
+"""Called with what is being done, how much is done, out of how much, and a text."""
 
 
 @dataclass(frozen=True)
@@ -69,7 +69,7 @@ class DataScaling:
     """Folder of the study, which `save` writes into."""
 
     def summary(self) -> None:
-        """Print the tables and what they say."""
+        """Print the tables and findings."""
         from wiw.report.data_scaling_tables import print_scaling
 
         print_scaling(self.table)
@@ -96,21 +96,21 @@ def data_scaling(
     episodes: int = 0,
     watch: Watch = lambda *_: None,
 ) -> DataScaling:
-    """Train small world models on nested parts of a dataset, measure them, and split the gain into data and updates.
+    """Train small world models on nested subsets of a dataset, evaluate them, and split the gain into data and updates.
 
         found = wiw.data_scaling("data", "runs/scaling", workers=2)
         found.summary()
         found.save()
 
-    The same call goes on where an earlier one was stopped; a training that was under way resumes from its last state.
+    The same call continues where an earlier one was stopped; an unfinished training resumes from its last checkpoint.
 
     Args:
-        data: folder of `wiw collect navigation`, of panoramas with depth; None collects 16 apartments in 128x256 into
+        data: folder of `wiw collect navigation`, with panoramas and depth; None collects 16 apartments at 128x256 into
             `out`.
         out: folder of the study.
         settings: sizes, models, seeds and what is measured; `wiw.studies.data_scaling_plan.SMALL` is the small version.
-        workers: processes, each with one thread.
-        episodes: of ImageNav in which the models of the first seed are run as well; none if 0.
+        workers: number of processes, each with one thread.
+        episodes: episodes of ImageNav in which to run the first seed's models as well; 0 for none.
         watch: called with progress.
 
     Raises:
@@ -237,7 +237,7 @@ def _prepare(plan: ScalingPlan, data: Path, folder: Path, watch: Watch) -> None:
 
 
 def _run_trainings(jobs: Sequence[TrainingJob], workers: int, watch: Watch) -> dict[Training, Measures]:
-    """Run what is not finished, and return the measures of all."""
+    """Run unfinished trainings, and return the measures of all."""
     found = {job.training: measures for job in jobs if (measures := job.read_measures()) is not None}
     costs = {job.training: job.training.updates + MEASURING for job in jobs}
     before, began = sum(costs[training] for training in found), time.monotonic()
@@ -251,7 +251,7 @@ def _run_trainings(jobs: Sequence[TrainingJob], workers: int, watch: Watch) -> d
 
 
 def _group_by_setting(measures: Mapping[Training, Measures]) -> dict[str, list[Measures]]:
-    """Return the measures of each training, those of its seeds in their order."""
+    """Return the measures of each training, in the order of its seeds."""
     found: dict[str, list[Measures]] = {}
     for training in sorted(measures, key=lambda each: each.seed):
         found.setdefault(training.setting, []).append(measures[training])

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Check a world model's contract by requests like the loop's, with findings in plain words."""
+"""Check a world model's contract with requests like the loop's, and report findings in plain words."""
 
 from __future__ import annotations
 
@@ -30,11 +30,11 @@ from wiw.world_models.base import WorldModel
 from wiw.world_models.pictures import CLOSE, OTHER
 
 WALKS = ((FORWARD, TURN_LEFT, FORWARD, FORWARD), (FORWARD, TURN_LEFT, TURN_RIGHT, TURN_RIGHT), (FORWARD,) * 4)
-"""No leading turns, which the loop makes itself. The first two begin alike, for models that say they are causal."""
+"""Plans without leading turns, which the loop makes itself. The first two share a beginning, for causal models."""
 
 
 def _poses(*places: tuple[float, float, float]) -> tuple[tuple[float, ...], ...]:
-    """Return poses with the hand down, open, and shut at the last."""
+    """Return poses with the hand down, open until the last, which is closed."""
     return tuple((*place, np.pi, 0.0, 0.0, float(i + 1 < len(places))) for i, place in enumerate(places))
 
 
@@ -43,24 +43,24 @@ POSES = (
     _poses((0.1, 0.0, 1.05), (0.15, 0.05, 1.0), (0.2, -0.1, 0.95), (0.2, -0.2, 0.85)),
     _poses((0.2, 0.0, 1.1), (0.25, 0.0, 1.05), (0.3, 0.0, 1.0), (0.3, 0.0, 0.95)),
 )
-"""Likewise of a gripper, over the table."""
+"""The same for a gripper above the table."""
 PLANS: Mapping[str, Any] = {PRIMITIVES: WALKS, GRIPPER_POSES: POSES}
 LENGTH = 4
-"""Actions of each."""
+"""Actions in each plan."""
 ALIKE = 2
-"""Actions with which the first two begin."""
+"""Actions that the first two plans share."""
 SHORT = 2
-"""Actions of a second length, for models that take any."""
+"""A second plan length, for models that take any."""
 NOISE = 8
-"""Levels of 255 up to which a difference may come of rounding."""
+"""Grey levels, of 255, up to which a difference may be due to rounding."""
 MARGIN = 0.06
-"""By how much another order of the frames has to fit better, in correlation."""
+"""How much better, in correlation, another order of the frames must fit."""
 MANY_JUMPS = 0.005
-"""Share of neighbouring pixels that jump from black to white in no ordinary picture."""
+"""Share of neighbouring pixels that jump from black to white, which ordinary images never reach."""
 SETTLE = 0.3
 """Seconds to wait for changes to an answer that is still being written to."""
 PICTURES: Mapping[str, str] = {"channels": "pictures", "scale": "pictures"}
-"""Kinds of a `ContractError` that belong to another check than the one in which they came up."""
+"""Kinds of `ContractError` that belong to a different check than the one that raised them."""
 RUNS: Mapping[str, tuple[str, int]] = {
     PRIMITIVES: ("100 episodes of ImageNav", 100 * 20 * 3),
     GRIPPER_POSES: ("200 episodes of manipulation", 200 * 3 * 5),
@@ -100,9 +100,9 @@ class Finding:
     """"needs", "raised", "deadline", the kind of a `ContractError`, "frame 0", "pictures", "training", "random",
     "batch", "causal", "history", "plan", "inputs", "memory", "describe", "version", or "slow"."""
     text: str
-    """The fault, what was seen, and what to do."""
+    """What is wrong, what was seen, and what to do."""
     serious: bool = True
-    """Whether the contract is broken; else it is good to know."""
+    """Whether the contract is broken; otherwise it is only a note."""
 
     def __str__(self) -> str:
         return self.text
@@ -118,11 +118,11 @@ class Check:
     skipped: str = ""
     """Reason why the check was skipped; empty if it was not."""
     detail: str = ""
-    """Further remark, such as a time."""
+    """A remark, such as a time."""
 
     @property
     def result(self) -> Result:
-        """In one word."""
+        """The result in one word."""
         if any(finding.serious for finding in self.findings):
             return "wrong"
         return "note" if self.findings else "skipped" if self.skipped else "passed"
@@ -136,23 +136,23 @@ def check_model(
         for finding in wiw.check_model(MyModel()):
             print(finding)
 
-    Looked at are type, dtype, shape, number of frames and NaN; frame 0; channel order, scale, orientation and order in
-    time of the frames, beside what an agent would truly see; networks left in training mode; what it does to its
-    inputs and to earlier answers; whether the same seeds give the same frames, whether a row depends on those beside
-    it, whether `causal` is true, whether the plan and, of a model that needs it, the history make a difference, and how
-    long it takes, if it answers at all.
+    Checks cover type, dtype, shape, number of frames and NaN; frame 0; channel order, scale, orientation and temporal
+    order of the frames, compared with what an agent would truly see; networks left in training mode; changes to inputs
+    and to earlier outputs; whether the same seeds give the same frames, whether a row depends on the others in its
+    batch, whether `causal` holds, whether the plan and (for a model that needs it) the history make a difference; and
+    how long a rollout takes, if it returns at all.
 
     Args:
         model: as `wiw.world_model` takes it: name, `path.py:Class`, class, instance, "remote:ws://...".
-        scenes: where the observations come from; of a model that takes poses, from the tables of manipulation.
-        deadline: seconds that a call or the constructor may take, after which it is not asked any more.
-        options: what the model is made with.
+        scenes: where the observations come from; for a model that takes poses, the tables of manipulation.
+        deadline: time limit in seconds for a call or the constructor, after which checking stops.
+        options: the model's options.
 
     Returns:
-        Findings, none where nothing is wrong; the contract is broken where one is `serious`.
+        Findings, empty if nothing is wrong; the contract is broken if one is `serious`.
 
     Raises:
-        RegistryError: no such model; other errors of wiw where it cannot be made.
+        RegistryError: no such model; other errors of wiw if it cannot be built.
         ArgumentError: a deadline that is not above 0.
     """
     checks = examine_model(model, scenes, deadline=deadline, **options)
@@ -326,7 +326,7 @@ class _ModelExaminer:
 
     @cached_property
     def _truth(self) -> list[Frames]:
-        """Frames that an agent would truly see after each action of each row's plan."""
+        """The frames that an agent would truly see after each action of each row's plan."""
         return self.queries.true_frames(self.rows, [row.plan for row in self.rows])
 
     def _select_action_frames(self) -> list[Frames]:
@@ -480,7 +480,7 @@ class _ModelExaminer:
         return Check("speed", (found,) if hours > LONG_RUN else (), detail=detail)
 
     def _build_difference_finding(self, kind: str, text: str, off: NDArray[np.int16]) -> Finding:
-        """Return a finding, which is not serious where it may be rounding."""
+        """Return a finding, which is not serious if it may be due to rounding."""
         if off.max() > NOISE:
             return Finding(kind, text)
         where = find_place_of_computation(self.model)
@@ -509,7 +509,7 @@ def _first_moment(history: History | None) -> History:
 
 
 def _pairs(rows: Sequence[Row]) -> list[tuple[Row, Row]]:
-    """Return rows with different plans from the same place."""
+    """Return pairs of rows with different plans from the same place."""
     return [(one, other) for one, other in combinations(rows, 2) if np.array_equal(one.image, other.image)]
 
 
