@@ -195,12 +195,12 @@ BROKEN = {
     "nan": (lambda frames, *_: frames * np.float32("nan"), {}, "with NaN"),
     "type": (lambda frames, *_: frames.tolist(), {}, "got list"),
     "frames": (lambda frames, *_: frames[:, 1:], {}, r"actions \+ 1.*got uint8 \(1, 4"),
-    "frame 0": (dark, {}, "frame 0 is not the observation: it is another picture"),
+    "frame 0": (dark, {}, "frame 0 is not the observation: it is a different image"),
     "frame 0, mirrored": (mirrored, {}, "frame 0 is not the observation: it is mirrored"),
     "frame 0, inverted": (inverted, {}, "frame 0 is not the observation: it is inverted"),
-    "frame 0, noise": (noise, {}, "frame 0 is not the observation: it is another picture"),
-    "channels": (bgr, {}, r"frame 0 is not the observation: red and blue are exchanged \(BGR\)"),
-    "channels, after frame 0": (bgr_after_frame_0, {}, r"after frame 0, red and blue are exchanged \(BGR\)"),
+    "frame 0, noise": (noise, {}, "frame 0 is not the observation: it is a different image"),
+    "channels": (bgr, {}, r"frame 0 is not the observation: red and blue are swapped \(BGR\)"),
+    "channels, after frame 0": (bgr_after_frame_0, {}, r"after frame 0, red and blue are swapped \(BGR\)"),
     "scale": (cast_without_scale, {}, r"floats from 0 to 1 were cast to uint8 without scaling; give np\.rint"),
     "scale, after frame 0": (cast_after_frame_0, {}, "after frame 0, no value is above 1"),
     "pictures, wrapped": (wrapped, {}, r"Values wrap around: at .*% of positions .*np\.clip"),
@@ -208,12 +208,12 @@ BROKEN = {
     "pictures, upside down": (upside_down_after_frame_0, {}, "After frame 0, frames are upside down"),
     "frame 0, shifted": (shift, {}, "Frame k is what follows action k"),
     "random": (by_chance, {}, "In two calls with the same seeds, 6 of 6 rows differ"),
-    "batch": (by_the_batch, {}, "alone, 2 of 2 rows differ from the same in a batch of 4"),
+    "batch": (by_the_batch, {}, "alone, 2 of 2 rows differ from the same rows in a batch of 4"),
     "batch, seeds": (from_the_first_seed, {}, "its own seed, not the whole batch's from the first one"),
     "causal": (looking_ahead, {"causal": True}, "It declares causal=True, but frames before"),
-    "inputs": (overwriting, {}, "It changes what it is given: observations.image"),
-    "inputs, plan": (moving_the_plan, {}, r"It changes what it is given: control\.viewpoints"),
-    "inputs, history": (forgetting, PAST, r"It changes what it is given: observations\.history\.images"),
+    "inputs": (overwriting, {}, "It modifies its inputs: observations.image"),
+    "inputs, plan": (moving_the_plan, {}, r"It modifies its inputs: control\.viewpoints"),
+    "inputs, history": (forgetting, PAST, r"It modifies its inputs: observations\.history\.images"),
     "batch, history": (counting_padding, PAST, "alone, 1 of 2 rows differ"),
     "raised, young": (needing_a_past, PAST, "IndexError"),
     "memory": (reusing(), {}, "An answer uses the memory of an earlier one"),
@@ -316,7 +316,7 @@ def test_a_gripper_that_is_not_looked_at_is_noted(monkeypatch):
     monkeypatch.setattr(model_check, "LONG_RUN", 0.0)
     findings = found(Blind, "nowhere")
     assert set(findings) == {"plan", "slow"} and not any(finding.serious for finding in findings.values())
-    assert "200 episodes of manipulation asks for about 3000 of them" in str(findings["slow"])
+    assert "200 episodes of manipulation requests about 3000 of them" in str(findings["slow"])
 
 
 def test_what_is_good_to_know_breaks_nothing(two_rooms, monkeypatch):

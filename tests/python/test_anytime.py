@@ -156,7 +156,7 @@ def test_a_run_stops_as_soon_as_it_has_shown_enough(tmp_path, capsys):
     for page in (str(numbers), log.report().read_text()):
         text = " ".join(page.split())
         assert (
-            f"looked at every 16 episodes, to stop once oracle-none excludes 0. It stopped at {stopped['episodes']}"
+            f"checked every 16 episodes, to stop once oracle-none excludes 0. It stopped at {stopped['episodes']}"
             in text
         )
         assert "a betting test over scenes" in text
@@ -230,7 +230,7 @@ def test_command_line(tmp_path, capsys):
     assert main([*run, "--until", "twin-none excludes 1"]) == 2
     assert "expected 'A-B excludes 0'" in capsys.readouterr().err and not (tmp_path / "run").exists()
     assert main([*run, "--until", "twin-none excludes 0"]) == 0
-    assert "until   twin-none excludes 0; a look every 4 episodes per arm" in capsys.readouterr().err
+    assert "until   twin-none excludes 0; checked every 4 episodes per arm" in capsys.readouterr().err
     assert wiw.load_run(tmp_path / "run").store.info["until"] == {"rule": "twin-none excludes 0", "every": 4}
     with sqlite3.connect(tmp_path / "run" / "run.sqlite") as store:
         store.execute("DELETE FROM outcome WHERE arm = 'twin' AND episode > 5")

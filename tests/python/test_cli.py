@@ -190,7 +190,7 @@ def test_a_world_model_takes_options(tmp_path, two_rooms, short, capsys):
     given = {"weights": "123", "strength": 0.25}
     assert taken == {"none": {}, "placebo-shuffled": given, "Tinted": given}
     assert main(["resume", str(tmp_path / "run"), "--no-report"]) == 0
-    for wrong, said in (("weights", "KEY=VALUE"), ("speed=3", "unexpected keyword"), ("strength=[", "no YAML")):
+    for wrong, said in (("weights", "KEY=VALUE"), ("speed=3", "unexpected keyword"), ("strength=[", "not valid YAML")):
         assert main([*task, *model, "--world-model-option", wrong, "--out", str(tmp_path / "again")]) == 2
         assert said in capsys.readouterr().err
         assert not (tmp_path / "again").exists()  # so that the same folder may be named once it is put right
@@ -434,8 +434,8 @@ def test_descriptions_of_flags_are_paragraphs(capsys):
     with suppress(SystemExit):
         main(["run", "--help"])
     words = " ".join(" ".join(line.strip("│ ") for line in capsys.readouterr().out.splitlines()).split())
-    assert "given again. isolate=false runs a model of your own in the process of the run. (repeatable)" in words
-    assert "the policy's own choice if not given. --revision-option" in words  # and no "(default: None)"
+    assert "repeated. isolate=false runs your own model in the run's process. (repeatable)" in words
+    assert "Default: the policy's own choice. --revision-option" in words  # and no "(default: None)"
     flags = StructTypeInfo.make(AgentFlags, AgentFlags(), False)
     texts = {field.name: field.helptext() for field in read_flags(flags).fields}
     assert all(texts.values()) and not any("\n" in text for text in texts.values())

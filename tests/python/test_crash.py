@@ -205,9 +205,7 @@ def test_a_store_cut_short_is_named_with_what_to_do(reference, tmp_path, share):
     path = tmp_path / "run.sqlite"
     path.write_bytes(data[: int(share * len(data))])
     for use in (load_run, RunStore.resume):
-        with pytest.raises(
-            StoreError, match=r"run\.sqlite.*(malformed|not a database|cut short).*bring back run\.sqlite"
-        ):
+        with pytest.raises(StoreError, match=r"run\.sqlite.*(malformed|not a database|truncated).*restore run\.sqlite"):
             use(tmp_path)
 
 

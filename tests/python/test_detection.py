@@ -71,7 +71,7 @@ def test_answers_that_break_the_contract_are_named(answer: Any, reason: str) -> 
         (IMAGES[0], ["a"], "uint8 \\[H, W, 3\\]"),
         (IMAGES.astype(float), ["a"], "float64"),
         (IMAGES, ["a", "a"], "distinct, non-empty names"),
-        (IMAGES, [" "], "not empty"),
+        (IMAGES, [" "], "non-empty"),
     ],
 )
 def test_questions_are_checked(images: Any, names: Any, message: str) -> None:

@@ -319,7 +319,7 @@ def test_a_scene_without_labels_has_no_things_to_change() -> None:
     scene = wiw.scenes.Scene.from_arrays(
         [{"positions": np.eye(3, dtype=np.float32), "triangles": np.array([[0, 1, 2]])}], name="plain"
     )
-    with pytest.raises(ArgumentError, match="plain has no things that could be drawn otherwise"):
+    with pytest.raises(ArgumentError, match="plain has no things that could be changed"):
         list_things(scene)
 
 

@@ -74,7 +74,7 @@ def test_the_oracle_needs_ids_of_its_scene() -> None:
         oracle.label(blank(IDS), FIELD)
     with pytest.raises(ArgumentError, match="got uint32 \\(1, 2, 2\\)"):
         oracle.label(blank(IDS), FIELD, IDS[:, :, :2])
-    with pytest.raises(ArgumentError, match="ids up to 5, got 6: views of another scene"):
+    with pytest.raises(ArgumentError, match="ids up to 5, got 6: these views are of another scene"):
         oracle.label(blank(IDS), FIELD, IDS + 1)
 
 

@@ -379,14 +379,14 @@ def write(file: str, text: str) -> Callable[[Path], None]:
     ("damage", "words"),
     [
         (edit_info(codebase_version="v2.1"), "format v3.0, got v2.1"),
-        (edit_info(fps=30), "expected 30 frames a second .* timestamps of 5"),
+        (edit_info(fps=30), "expected 30 frames per second .* timestamps of 5"),
         (edit_info(total_episodes=99), "expected 99 episodes .* got "),
         (edit_info(data_path="data/{episode}.parquet"), "data_path of chunk_index and file_index"),
         (edit_info(features={}), "got no observation.state"),
         (edit_feature(RGB, dtype="video"), "as image .* got video .* no longer exact"),
         (edit_feature(DEPTH, shape=[8, 8, 1]), r"as image \[36, 64, 1\], got image \[8, 8, 1\]"),
-        (lambda folder: (folder / "meta/info.json").unlink(), "info.json is missing"),
-        (lambda folder: (folder / "meta/wiw.json").unlink(), "wiw.json is missing; expected .* `wiw data export`"),
+        (lambda folder: (folder / "meta/info.json").unlink(), "info.json does not exist"),
+        (lambda folder: (folder / "meta/wiw.json").unlink(), "wiw.json does not exist; expected .* `wiw data export`"),
         (lambda folder: (folder / EPISODE_FILE).unlink(), "episodes as meta/info.json says, got 0"),
         (lambda folder: (folder / FRAME_FILE).unlink(), "file-000.parquet is missing"),
         (drop_column(FRAME_FILE, "T_world_camera"), "expected columns .* got no T_world_camera"),
@@ -414,7 +414,7 @@ def test_what_cannot_be_imported_is_told(
     damage(folder)
     with pytest.raises(FileError, match=words):
         import_lerobot(folder, tmp_path / "out")
-    assert sorted(path.name for path in tmp_path.iterdir()) == ["bad"], "nothing half-written is left"
+    assert sorted(path.name for path in tmp_path.iterdir()) == ["bad"], "no partial file is left"
 
 
 def test_depth_that_is_no_depth_is_told(exported: Path, tmp_path: Path) -> None:
@@ -425,9 +425,9 @@ def test_depth_that_is_no_depth_is_told(exported: Path, tmp_path: Path) -> None:
 
 
 def test_what_cannot_be_exported_is_told(navigation: Path, manipulation: Path, tmp_path: Path) -> None:
-    with pytest.raises(FileError, match=r"manifest\.json is missing"):
+    with pytest.raises(FileError, match=r"manifest\.json does not exist"):
         export_lerobot(tmp_path / "nothing", tmp_path / "out")
-    with pytest.raises(ArgumentError, match="1 frame a second or more, got 0"):
+    with pytest.raises(ArgumentError, match="at least 1 frame per second, got 0"):
         export_lerobot(navigation, tmp_path / "out", fps=0)
     with pytest.raises(ArgumentError, match="1 worker or more, got 0"):
         export_lerobot(navigation, tmp_path / "out", workers=0)

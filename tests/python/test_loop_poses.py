@@ -295,7 +295,10 @@ def test_results_do_not_depend_on_who_else_is_live(tmp_path: Path) -> None:
         ({"model": "warp"}, "this agent plans in poses of a gripper"),
         ({"model": Spy(control="action", space="pose7", view="panorama")}, "imagines panoramas"),
         ({"model": Spy(control="viewpoint", space="pose7")}, "do not move the camera"),
-        ({"model": "copy", "depth": 2}, "proposes from imagined places, but poses of a gripper lead to none"),
+        (
+            {"model": "copy", "depth": 2},
+            "proposes plans from imagined places, but poses of a gripper do not lead to other places",
+        ),
         ({"model": "copy", "reviser": "heuristic"}, "plans in poses of a gripper, but the reviser"),
     ],
 )

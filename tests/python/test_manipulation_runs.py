@@ -126,13 +126,13 @@ def test_a_run_that_was_stopped_goes_on(run: Path, tmp_path: Path, monkeypatch: 
 @pytest.mark.parametrize(
     ("flags", "said"),
     [
-        (["--scenes", "apartments:val"], "scenes: this is for tasks in which an agent walks"),
-        (["--motion", "slide"], "motion: this is for"),
-        (["--per-scene", "2"], "per_scene: this is for"),
-        (["--episode-file", "x.json", "--scene-folder", "y"], "episode_file, scene_folder: this is for"),
+        (["--scenes", "apartments:val"], "scenes: only for tasks in which an agent walks"),
+        (["--motion", "slide"], "motion: only for"),
+        (["--per-scene", "2"], "per_scene: only for"),
+        (["--episode-file", "x.json", "--scene-folder", "y"], "episode_file, scene_folder: only for"),
         (["--tasks", "juggle"], "push_buttons, slide_block, insert_peg, stack_cups, got juggle"),
         (["--tasks", "slide_block,slide_block"], "different ones"),
-        (["--preset", "official"], "there are default, paper"),
+        (["--preset", "official"], "choose from default, paper"),
         (["--task-option", "actions=0"], "must be positive"),
         (["--task-option", "decisions=3"], "unknown rule 'decisions'; there are actions"),
     ],

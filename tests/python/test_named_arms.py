@@ -82,9 +82,9 @@ def test_arms_share_the_options_of_their_agent_and_have_their_own(shade):
 @pytest.mark.parametrize(
     ("arms", "message"),
     [
-        (["a=copy", "a=warp"], r"different world models, got \['a', 'a'\]; .*names of their own: big="),
+        (["a=copy", "a=warp"], r"different world models, got \['a', 'a'\]; .*name them: big="),
         (["warpnet?weights=a", "warpnet?weights=b"], r"got \['warpnet', 'warpnet'\]; .*big=warpnet\?weights="),
-        (["=copy"], "expected a name without surrounding spaces around it, got '' in '=copy'"),
+        (["=copy"], "expected a name without surrounding spaces, got '' in '=copy'"),
         (["a/b=copy"], "name 'a/b' in 'a/b=copy' contains '/'"),
         (["a="], "expected NAME=MODEL"),
         (["a=warpnet?"], "expected NAME=MODEL"),
@@ -92,13 +92,13 @@ def test_arms_share_the_options_of_their_agent_and_have_their_own(shade):
         (["a=warpnet?weights"], "expected KEY=VALUE, got 'weights'"),
         (["a=warpnet?weights=x&weights=y"], "'weights' is given twice"),
         (["a=none?steps=3"], "has options but no named world model"),
-        (["oracle=warp"], "reports take the arm 'oracle' for the reference"),
+        (["oracle=warp"], "the name 'oracle' is reserved for the reference"),
         (["copy=placebo-shuffled:copy"], "choose another name"),
         ({"": "copy"}, "expected a name without surrounding spaces"),
         ({" a": "copy"}, "expected a name without surrounding spaces"),
         ({"a,b": "copy"}, "contains ','"),
         ({"a\nb": "copy"}, "contains"),
-        ({"a": "b=copy"}, "has the names 'a' and 'b'"),
+        ({"a": "b=copy"}, "is named both 'a' and 'b'"),
     ],
 )
 def test_wrong_arms_are_refused_with_a_hint(arms, message):

@@ -483,7 +483,7 @@ def test_a_damaged_picture_is_told() -> None:
     segment = made_up(np.random.default_rng(0), 2, 0, True, False)
     for data in (b"no picture", b"", None):
         broken = replace(segment, encoded_images=(data, segment.encoded_images[1]))
-        with pytest.raises(FileError, match=r"expected a picture in frame 0.*wiw data verify"):
+        with pytest.raises(FileError, match=r"expected an image in frame 0.*wiw data verify"):
             _ = broken.images
 
 

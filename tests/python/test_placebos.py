@@ -270,7 +270,7 @@ def test_a_swap_needs_another_episode(two_rooms, tmp_path) -> None:
 @pytest.mark.parametrize(
     ("command", "said"),
     [
-        (["ar", "--episodes", "1", "--arms", "none,placebo-swapped"], "expected at least 2 episodes, got 1"),
+        (["ar", "--episodes", "1", "--arms", "none,placebo-swapped"], "so it needs at least 2 episodes; got 1"),
         (
             ["manipulation", "--world-model", "armnet", "--arms", "none,placebo-shuffled"],
             "these plans contain none",

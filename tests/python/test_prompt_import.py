@@ -123,8 +123,8 @@ def test_a_checkout_is_read_and_not_run(tmp_path: Path) -> None:
     [
         ("AR Planner Prompt", r"\{obs\_key\}", "lacks look_ahead_action_num"),
         ("AR Planner Prompt", r"\{room\}", "unknown slot 'room' in the prompt for ar/planner; expected obs_key"),
-        ("AR Answerer Prompt", r"What is \weird{it}?", r"main\.tex:7: command \\weird is not known"),
-        ("AR Answerer Prompt", r"\begin{tabular}", "environment 'tabular' is not known"),
+        ("AR Answerer Prompt", r"What is \weird{it}?", r"main\.tex:7: unknown command \\weird"),
+        ("AR Answerer Prompt", r"\begin{tabular}", "unknown environment 'tabular'"),
         ("AR Answerer Prompt", r"\textbf{What", "a brace or a list is not closed"),
         ("AR Answerer Prompt", r"\item x", r"\\item outside a list"),
         ("AR Answerer Prompt", "% nothing", "the prompt for ar/answerer is empty"),

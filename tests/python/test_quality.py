@@ -209,7 +209,7 @@ BAD = {
     "partial": ("i < 3 and " + GOOD, "ended with 3 of 4 images answered"),
     "malformed": (
         "print('loading weights', flush=True)",
-        "'loading weights'; anything else belongs on the standard error",
+        "'loading weights'; print anything else to standard error",
     ),
     "unknown": ("print(json.dumps({'path': 'x', 'scores': {}}), flush=True)", "'x', which it was not asked about"),
     "repeated": (f"[{GOOD} for _ in range(2)]", "scored .* twice"),

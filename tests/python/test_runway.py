@@ -103,7 +103,7 @@ def test_a_task_that_takes_for_ever_is_given_up_and_found_again(service, made):
 def test_the_budget_is_kept(service, made):
     model = made(budget=2 * fake_runway.COST)
     rollout(model, [(FORWARD,), (TURN_LEFT,)], [1, 2])
-    with pytest.raises(InfrastructureError, match="50 credits are spent of budget=50"):
+    with pytest.raises(InfrastructureError, match="50 credits of budget=50 are spent"):
         rollout(model, seeds=[3])
     assert len(service.orders) == 2
 

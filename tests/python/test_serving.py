@@ -678,7 +678,7 @@ def test_rows_that_the_model_does_not_take_are_refused_one_by_one():
         "pixels": other_size,
         "does not take it": pack_row(make_conditioning(1, ("depth",)), 0, plans(1)[0], 7),
         "at least 1": row(0),
-        "no msgpack": b"\xc1",
+        "not valid msgpack": b"\xc1",
         "missing fields": b"\x80",
     }
     model = Plain()

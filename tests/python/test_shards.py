@@ -129,7 +129,7 @@ def test_the_command_line_runs_merges_and_compares(tmp_path, capsys):
     assert main(["compare", str(tmp_path / "whole"), str(tmp_path / "merged")]) == 0
     assert read_rows(tmp_path / "merged") == read_rows(tmp_path / "whole")
     assert main(["merge", str(tmp_path / "parts"), "--out", str(tmp_path / "merged")]) == 2
-    assert "holds a run already" in capsys.readouterr().err
+    assert "already holds a run" in capsys.readouterr().err
 
 
 def test_missing_episodes_are_named_and_can_be_run(tmp_path, capsys):
@@ -168,7 +168,9 @@ def test_unlike_agents_are_refused_though_the_first_store_has_not_begun_that_arm
     edit(parts[0], "UPDATE run SET info = json_remove(info, '$.built.none')")
     assert wiw.merge(parts, tmp_path / "merged").complete
     edit(parts[2], "UPDATE run SET info = json_set(info, '$.built.none.weights', 'others')")
-    with pytest.raises(StoreError, match=r"2 and .*3 had unlike agents: agent none.weights: \"absent\" and \"others\""):
+    with pytest.raises(
+        StoreError, match=r"2 and .*3 had different agents: agent none.weights: \"absent\" and \"others\""
+    ):
         wiw.merge(parts, tmp_path / "again")
 
 
@@ -205,7 +207,9 @@ def test_unlike_records_of_built_in_parts_are_refused(tmp_path, two_rooms):
     shutil.copytree(tmp_path / "1", tmp_path / "2")
     assert wiw.merge([tmp_path / "1", tmp_path / "2"], tmp_path / "merged").repeated == 1
     edit(tmp_path / "2", "UPDATE decision SET after_x = after_x + 1e-9")
-    with pytest.raises(StoreError, match=r"none episode 0 has unlike records .* equal ones are promised .*: after_x"):
+    with pytest.raises(
+        StoreError, match=r"none episode 0 has different records .* its parts guarantee equal ones .*: after_x"
+    ):
         wiw.merge([tmp_path / "1", tmp_path / "2"], tmp_path / "again")
 
 

@@ -176,7 +176,7 @@ def test_an_agents_own_arm_is_named_by_the_class_of_its_model_behind_all_wrapper
 
 def test_an_existing_run_is_continued_only_on_request(reference, tmp_path):
     first = run(tmp_path / "run")
-    with pytest.raises(StoreError, match="holds a run already"):
+    with pytest.raises(StoreError, match="already holds a run"):
         run(tmp_path / "run")
     assert facts(run(tmp_path / "run", resume=True)) == facts(first) == facts(reference)
     with pytest.raises(StoreError, match=r"another configuration \(arms\.\w+\.drive: the run has [0-9.]+, now 0\.9\)"):

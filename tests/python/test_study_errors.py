@@ -84,7 +84,7 @@ def test_the_words_say_what_the_numbers_do(table) -> None:
     text = " ".join(explain(table))
     assert "Errors of control cost 12.5" in text and "control costs more" in text
     assert "Errors of looks cost 0.0" in text and "error-lag@4" in text
-    assert "Left out, for they make no sense in imagenav: open." in text
+    assert "Left out, as they make no sense in imagenav: open." in text
 
 
 def test_the_page_has_figure_tables_and_units(table, tmp_path: Path) -> None:

@@ -96,7 +96,7 @@ def test_a_study_that_was_begun_may_gain_arms_and_nothing_else(own: Path, tmp_pa
     assert log.arms == ["none", "front", "around"]
     assert [each["arms"] for each in log.store.info["arms_added"]] == [["front"]]
     for names, changes in ((("none", "front"), {}), (("none", "front", "around"), {"candidates": 3})):
-        with pytest.raises(StoreError, match=r"run of another configuration \(arms"):
+        with pytest.raises(StoreError, match=r"run with a different configuration \(arms"):
             run("grown", *names, **changes)
 
 
@@ -123,7 +123,11 @@ def test_variables_are_filled_in_and_arms_are_merged(own: Path) -> None:
             '"{modle}", reviser',
             "runs: here: agent: model: unknown name 'modle'.*Did you mean model",
         ),
-        ("small: {episodes", "small: {episode", "small: unknown name 'episode'; there are scenes, model, episodes"),
+        (
+            "small: {episodes",
+            "small: {episode",
+            "small: unknown name 'episode'; expected one of scenes, model, episodes",
+        ),
         ("policy: heuristic, ", "", "arms: none: expected a policy, here or in `agent`, got none"),
         ("candidates: 2", "candidate: 2", "arms: none: unknown name 'candidate'.*Did you mean candidates"),
         ("[around, front], ", "[round, front], ", "compare: unknown name 'round'.*Did you mean around"),
@@ -136,7 +140,7 @@ def test_variables_are_filled_in_and_arms_are_merged(own: Path) -> None:
         ("seed: 3", "cache: off", "settings: cache: expected text or a path.*, got False"),
         ("candidates: 2", "candidates: two", "arms: none: candidates: expected a whole number or null, got 'two'"),
         ("candidates: 2", "ground_truth: scoring", "ground_truth: expected a list.*, got 'scoring'"),
-        ("{model: none, reviser: null}", "{model: copy}", "reports take the arm 'none' for the reference"),
+        ("{model: none, reviser: null}", "{model: copy}", "the name 'none' is reserved for the reference"),
         ("      front:", "      fr/ont:", "arms"),
         ("runs:\n  here:", "runs: {}\nsmal:\n  here:", "unknown name 'smal'"),
     ],

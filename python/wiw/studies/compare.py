@@ -98,7 +98,7 @@ def compare(
     pairs = _list_pairs(first, second, arm, other)
     require_comparable(first, second, pairs, unlike_budgets)
     differing = list_unlike_budgets(first, second, pairs)
-    unlike = [f"UNLIKE BUDGETS: {'; '.join(differing)}."] if differing else []
+    unlike = [f"DIFFERENT BUDGETS: {'; '.join(differing)}."] if differing else []
     names = _name_runs(first, second)
     sides = [
         (log, {pair[side]: f"{pair[side]} · {names[side]}" for pair in pairs})
