@@ -155,7 +155,7 @@ def test_unlike_budgets_are_refused_unless_they_are_asked_for(tmp_path, horizon,
     with pytest.raises(StoreError, match=message):
         wiw.compare(runs[0], runs[1])
     assert main(["compare", *map(str, runs[:2]), "--unlike-budgets"]) == 0
-    assert f"carries out 3 and {count} actions" in " ".join(capsys.readouterr().out.split())
+    assert f"executes 3 and {count} actions" in " ".join(capsys.readouterr().out.split())
     assert not any("BUDGETS" in line for line in wiw.compare(runs[0], runs[2]).remarks())
 
 
