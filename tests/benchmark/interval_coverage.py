@@ -79,7 +79,7 @@ def main() -> None:
         line("mean of rates and differences", [f"{np.mean(means[design]):.1f}" for design in SHOWN])
         line("their mean width, points", [f"{np.mean(widths[design]):.1f}" for design in SHOWN])
         for share in (0.1, 0.3):
-            name = f"found though absent, {share:.0%} won and lost"
+            name = f"false positives of the test, {share:.0%} won and lost"
             line(name, [f"{measure_errors(share, DESIGNS[design], correlation, 4000):.1f}" for design in SHOWN])
     for correlation in CORRELATIONS[:2]:
         print(f"\ncorrelation within scenes {correlation:g}: others")

@@ -66,7 +66,7 @@ on a task, for one world model or several on the same episodes, and measures how
 `wiw COMMAND --help` explains each command with examples. `--debug` shows the full traceback of an error.
 
 Exit codes: 0 success, 1 the run is invalid (verify: something differs; judge: marks are missing), 2 error, 130 stopped
-by Ctrl-C, 75 stopped within 5 seconds by SIGTERM or SIGUSR2. A stopped run keeps everything recorded so far; `wiw
+by Ctrl-C, 75 stopped within 6 seconds by SIGTERM or SIGUSR2. A stopped run keeps everything recorded so far; `wiw
 resume` continues it."""
 
 COMMANDS: tuple[tuple[Callable[..., int], str, str], ...] = (
