@@ -40,7 +40,7 @@ def test_help_teaches_by_examples(capsys):
         (["check-model"], "wiw check-model my_model.py:MyModel"),
         (["verify"], "--episodes 10"),
         (["export"], "--rerun first.rrd"),
-        ([], "75 stopped within 5 seconds by SIGTERM"),
+        ([], "75 stopped within 6 seconds by SIGTERM"),
         (["scenes"], "apartments:val:4"),
         (["demo"], "oracle, a reference"),
         (["collect"], "--out demos --workers 4"),
