@@ -55,7 +55,7 @@ def is_stop_request(error: BaseException) -> bool:
 def find_raising_line(error: BaseException) -> traceback.FrameSummary | None:
     """Return the line of a user's code at which an exception was raised, or that led to it.
 
-    It is the last line outside wiw and installed packages, or else outside wiw; None where no other line was reached.
+    It is the last line outside wiw and installed packages, or else outside wiw; None if no other line was reached.
     """
     frames = traceback.extract_tb(error.__traceback__)
     foreign = [frame for frame in frames if not frame.filename.startswith((OWN, "<"))]
@@ -191,4 +191,4 @@ class StoreError(Error):
 
 
 class TrainingError(Error):
-    """A training cannot go on: its loss or its gradient is not finite. The message names the batch."""
+    """A training cannot continue: its loss or its gradient is not finite. The message names the batch."""

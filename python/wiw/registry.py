@@ -35,7 +35,7 @@ class Registry:
     kind: str
     """As in messages: "world model"."""
     group: str
-    """Entry-point group; empty where packages add none."""
+    """Entry-point group; empty if packages add none."""
     built_in: dict[str, str]
     """Name to `module:attribute`. A name that ends with a colon takes what is written after it as first argument."""
     base: str = ""
@@ -44,9 +44,9 @@ class Registry:
     """Things that programs have added under names of their own (`register`)."""
     door: str = ""
     """`module:function` that returns what stands for a part of somebody else's, given its name, so that its code is
-    imported and run in a process of its own; empty where such parts are run in this one."""
+    imported and run in a separate process; empty if such parts are run in this one."""
     prefix: str = ""
-    """Beginning of the names that go through the door; empty where those of all parts of somebody else's do."""
+    """Beginning of the names that go through the door; empty if those of all parts of somebody else's do."""
 
     def names(self) -> list[str]:
         """Return all registered names, built-in ones first."""
@@ -263,7 +263,7 @@ WORLD_MODELS = Registry(
     door="wiw.isolation.models:find_isolated_model",
 )
 ISOLATED = "isolated:"
-"""Beginning of the name of a policy that is to run in a process of its own."""
+"""Beginning of the name of a policy that is to run in a separate process."""
 FUNCTION = "wiw.world_models.function:Function"
 """Class that makes a world model of a function."""
 POLICIES = Registry(

@@ -63,7 +63,7 @@ class Marks:
 def read_marks(
     judge: JudgeRecord | None, outcomes: Iterable[Mapping[str, Any]], arms: Sequence[str], tables: TableSpec
 ) -> Marks | None:
-    """Return whose marks outcomes have; None where no marks are given."""
+    """Return whose marks outcomes have; None if no marks are given."""
     if judge is None:
         return None
     approximate, missing = dict.fromkeys(arms, 0), 0

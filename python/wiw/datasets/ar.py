@@ -119,10 +119,10 @@ class EpisodeRules:
     """Rules that a target and a start of an episode satisfy. Lengths in metres, sizes in steradians."""
 
     nearest: float = 0.7
-    """Least horizontal distance from the start to the target's centre."""
+    """Minimum horizontal distance from the start to the target's centre."""
     farthest: float = 5.0
     seen: float = 0.0025
-    """Least size of what is seen of the target at the start: 75 pixels of the panorama at eye level."""
+    """Minimum size of what is seen of the target at the start: 75 pixels of the panorama at eye level."""
     hidden: float = HIDDEN[0]
     """Heavily occluded: at most this share of the target is visible ..."""
     small: float = 0.25
@@ -130,15 +130,15 @@ class EpisodeRules:
     tiny: float = 0.008
     """... and is no larger than this, 5 degrees across."""
     clear: float = 0.7
-    """Least visible share in the best view."""
+    """Minimum visible share in the best view."""
     large: float = 0.02
-    """Least size of the best view: 8 degrees across ..."""
+    """Minimum size of the best view: 8 degrees across ..."""
     enough: float = 0.3
     """... and the size above which it gets no better: 31 degrees across."""
     gain: float = 2.5
     """How much larger than at the start the target must be seen there, at least."""
     budget: int = 8
-    """Most primitives from the start to the best view; the paper's 10 decisions leave 9 to carry out."""
+    """Maximum number of primitives from the start to the best view; the paper's 10 decisions leave 9 to carry out."""
     turned: float = 67.5
     """Most degrees between the start's heading and the target."""
     survey: int = 250
@@ -318,7 +318,7 @@ def _episode(
 
 
 def _find_reason(size: float, share: float, averted: bool, best: _View, rules: EpisodeRules) -> str | None:
-    """Return why a first look is hard where the best view mends it; None where it is not, or where that does not."""
+    """Return why a first look is hard where the best view mends it; None if it is not, or where that does not."""
     if averted:
         return AVERTED_LOOK
     if best.size < rules.gain * size:
@@ -331,7 +331,7 @@ def _find_reason(size: float, share: float, averted: bool, best: _View, rules: E
 def find_front(world: World, instance: Mapping[str, Any]) -> NDArray[np.float64] | None:
     """Return the horizontal direction that an instance faces, float64 [3] of unit length.
 
-    None where it is not known: in scenes other than the generated apartments, whose furniture is built to face its own
+    None if it is not known: in scenes other than the generated apartments, whose furniture is built to face its own
     +z, and of things that look alike from all sides.
     """
     if "layout" not in world.scene.attributes or category_of(instance) in FRONTLESS:

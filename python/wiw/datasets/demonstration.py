@@ -60,7 +60,7 @@ class Demonstration:
     encoded_depths: tuple[bytes, ...] | None = None
     """T depths of the front view, 16-bit PNG."""
     encoded_wrist_images: tuple[bytes, ...] | None = None
-    """T views of the wrist camera, JPEG or PNG; None where none were collected."""
+    """T views of the wrist camera, JPEG or PNG; None if none were collected."""
     encoded_wrist_depths: tuple[bytes, ...] | None = None
     """T depths of the wrist camera's view, 16-bit PNG."""
     wrist_poses: NDArray[np.float64] | None = None
@@ -88,7 +88,7 @@ class Demonstration:
 
     @cached_property
     def depths(self) -> NDArray[np.float32] | None:
-        """float32 [T, H, W]: their planar depths in metres, 0 where nothing is hit; None where none were collected.
+        """float32 [T, H, W]: their planar depths in metres, 0 where nothing is hit; None if none were collected.
 
         Raises:
             FileError: one of them is damaged.

@@ -127,7 +127,7 @@ class Demonstrations(Sequence[Demonstration]):
 
     @property
     def wrist_intrinsics(self) -> NDArray[np.float64] | None:
-        """Intrinsics float64 [3, 3] of the wrist camera, as in `FrontCamera`; None where its views were not collected.
+        """Intrinsics float64 [3, 3] of the wrist camera, as in `FrontCamera`; None if its views were not collected.
 
         Raises:
             FileError: nothing has been collected yet.

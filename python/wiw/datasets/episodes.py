@@ -21,7 +21,7 @@ from wiw.types import Episode
 
 VERSION = 1
 MOST_BYTES = 256 << 20
-"""Most bytes of an episode file, unpacked; 100,000 episodes take about 50 MB."""
+"""Maximum size of an episode file in bytes, unpacked; 100,000 episodes take about 50 MB."""
 
 
 def save(path: str | Path, episodes: Sequence[Episode], task: str, **about: Any) -> None:

@@ -139,7 +139,7 @@ def _world_in_world(item: Mapping[str, Any], where: str, folder: Path) -> Episod
 
 
 def _find_picture(folder: Path, relative: str) -> str | None:
-    """Return the whole path of a picture within a folder; None where it is not there."""
+    """Return the whole path of a picture within a folder; None if it is not there."""
     path = (folder / relative).resolve()
     return str(path) if path.is_relative_to(folder.resolve()) and path.is_file() else None
 

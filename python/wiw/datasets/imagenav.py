@@ -59,14 +59,14 @@ class EpisodeRules:
     """Rules that a start and a goal of an episode satisfy. Lengths in metres."""
 
     shortest: float = 2.0
-    """Least geodesic distance."""
+    """Minimum geodesic distance."""
     longest: float = 8.0
     budget: int = 42
-    """Most primitives an ideal run may need: 70 % of the paper's 20 decisions of 3 primitives."""
+    """Maximum number of primitives an ideal run may need: 70 % of the paper's 20 decisions of 3 primitives."""
     goal_depth: float = 1.2
-    """Least median depth of the goal view, so that it shows more than a wall."""
+    """Minimum median depth of the goal view, so that it shows more than a wall."""
     goal_instances: int = 4
-    """Least number of things in the goal view, the outside counted. In a scene of fewer, such as a scan that is one
+    """Minimum number of things in the goal view, the outside counted. In a scene of fewer, such as a scan that is one
     mesh, nothing is asked of their number."""
     attempts: int = 400
     """Pairs tried per episode before giving up; ten times as many within a tier."""
@@ -85,7 +85,7 @@ class EpisodeRules:
 
     @property
     def tiers(self) -> tuple[str, ...]:
-        """Tiers that episodes are of, in turn; empty where they are of none."""
+        """Tiers that episodes are of, in turn; empty if they are of none."""
         return {"any": (), "all": tuple(TIERS)}.get(self.tier, (self.tier,))
 
 

@@ -230,7 +230,7 @@ def write_meta(folder: Path, meta: Mapping[str, Any]) -> None:
 
 
 def read_navigation_manifest(folder: Path) -> dict[str, Any]:
-    """Return the settings with which a folder was begun.
+    """Return the settings with which a folder was started.
 
     Raises:
         FileError: there is no manifest, or it is not one of a navigation dataset.

@@ -53,9 +53,9 @@ class NavigationSegment:
     rolls: NDArray[np.int32]
     """int32 [T]: columns to roll it by, to the right."""
     encoded_images: tuple[bytes | None, ...]
-    """T pictures, JPEG or lossless WebP; None where `sources` names another frame."""
+    """T pictures, JPEG or lossless WebP; None if `sources` names another frame."""
     encoded_depths: tuple[bytes | None, ...] | None
-    """T depths, 16-bit PNG in millimetres, likewise; None where none were collected."""
+    """T depths, 16-bit PNG in millimetres, likewise; None if none were collected."""
 
     def __len__(self) -> int:
         return len(self.actions)
@@ -71,7 +71,7 @@ class NavigationSegment:
 
     @cached_property
     def depths(self) -> NDArray[np.float32] | None:
-        """float32 [T, H, W]: metres, 0 where nothing is hit; None where none were collected.
+        """float32 [T, H, W]: metres, 0 where nothing is hit; None if none were collected.
 
         Along the ray for panoramas, planar for perspective views.
 

@@ -19,9 +19,9 @@ PLACES = 64
 STOREY = 1.0
 """Metres by which floor lies at least below a roof."""
 COVERED = 0.25
-"""Least share of a roof that has floor of another island below it; furniture and walls take much of the rest."""
+"""Minimum share of a roof that has floor of another island below it; furniture and walls take much of the rest."""
 OPEN = 0.5
-"""Least share of a roof that has nothing above it."""
+"""Minimum share of a roof that has nothing above it."""
 EYE = 0.5
 """Metres above the surface from which to look up."""
 UPWARD = (16, 8)

@@ -130,7 +130,7 @@ def _find_nearest(view: FloorView, cells: NDArray[np.bool_], place: NDArray[np.f
 
 
 def find_broken_rule(world: World, start: NDArray[np.float64], goal: NDArray[np.float64]) -> str | None:
-    """Return the first rule of the tier `beyond` that a start and a goal break; None where they break none.
+    """Return the first rule of the tier `beyond` that a start and a goal break; None if they break none.
 
     The goal itself is taken to be out of sight already.
     """

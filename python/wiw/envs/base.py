@@ -66,7 +66,7 @@ class Env(ABC):
 
     @abstractmethod
     def run(self, plan: Any, answer: Answer | TextAnswer | None = None) -> Segment:
-        """Carry out the actions of one decision, as far as the episode goes on, and observe once, at the end.
+        """Carry out the actions of one decision, as far as the episode continues, and observe once, at the end.
 
         `answer` is what the agent believes now; the loop gives it only where the goal expects one.
         """
@@ -119,7 +119,7 @@ class Env(ABC):
 
 
 def read_episode_option(options: Mapping[str, Any] | None) -> Any:
-    """Return the "episode" of gymnasium's reset options; None where it is left open.
+    """Return the "episode" of gymnasium's reset options; None if it is left open.
 
     Raises:
         ArgumentError: another option.

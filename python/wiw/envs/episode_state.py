@@ -36,7 +36,9 @@ class NavigationSpec(ABC):
 
     @property
     def limit(self) -> int | None:
-        """Most primitives of an episode, however they are divided over decisions; None where decisions are counted."""
+        """Maximum number of primitives of an episode, however they are divided over decisions; None if decisions are
+        counted.
+        """
         return None
 
     @property
@@ -57,7 +59,7 @@ class NavigationSpec(ABC):
     @property
     @abstractmethod
     def episode_count(self) -> int | None:
-        """How many episodes there are; None where there is no end of them."""
+        """How many episodes there are; None if there is no end of them."""
 
     @property
     def pointing(self) -> Pointing | None:

@@ -123,7 +123,7 @@ class ManipulationEnv(gymnasium.Env[dict[str, Any], NDArray[np.float64]], Env):
         return self._observe()
 
     def run(self, plan: ArrayLike, answer: Answer | TextAnswer | None = None) -> Segment:
-        """Carry out one decision's poses [K, 7], as far as the episode goes on; observe once, at the end.
+        """Carry out one decision's poses [K, 7], as far as the episode continues; observe once, at the end.
 
         Raises:
             ArgumentError: as `check_poses`; nothing has moved then.

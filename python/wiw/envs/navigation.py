@@ -110,7 +110,7 @@ class NavigationEnv(gymnasium.Env[dict[str, Any], int], Env):
         return self._observe()
 
     def run(self, plan: Sequence[int] | NDArray[np.int8], answer: Answer | TextAnswer | None = None) -> Segment:
-        """Carry out one decision's primitives, as far as the episode goes on; observe once, at the end.
+        """Carry out one decision's primitives, as far as the episode continues; observe once, at the end.
 
         Where the goal expects an answer, `answer` comes first, and nothing is carried out after the last one.
 

@@ -23,6 +23,6 @@ class EndedError(Exception):
 
 
 class RaisedError(Exception):
-    """The code has raised an exception in a process of its own; the message has its type, text and place."""
+    """The code has raised an exception in a separate process; the message has its type, text and place."""
 
     kind = "raised"

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""World models of one's own, each in a process of its own.
+"""World models of one's own, each in a separate process.
 
 `find_isolated_model` returns a class that stands for the one behind a name: it tells the same about itself, and an
 instance of it passes each rollout on to the instance in its process. Nothing of the model's code is imported here.
@@ -51,7 +51,7 @@ def find_isolated_model(name: str) -> type[IsolatedModel]:
     """Return the class that stands for the world model of a name, such as "model.py:MyModel".
 
     Raises:
-        RegistryError: it cannot be imported, which is tried in a process of its own.
+        RegistryError: it cannot be imported, which is tried in a separate process.
     """
     return _make_class(name, read_file_state(name))
 
@@ -75,7 +75,7 @@ def _make_class(name: str, state: tuple[str, int, int] | None) -> type[IsolatedM
 
 
 class IsolatedModel(Isolated, WorldModel):
-    """Stands for a world model in a process of its own.
+    """Stands for a world model in a separate process.
 
     Args:
         isolate: False makes the model in this process instead, and returns it itself.

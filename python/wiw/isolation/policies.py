@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Policies of one's own, each in a process of its own, by the name "isolated:policy.py:MyPolicy".
+"""Policies of one's own, each in a separate process, by the name "isolated:policy.py:MyPolicy".
 
 The memories of episodes stay in that process; the loop holds handles of them.
 """
@@ -34,7 +34,7 @@ def find_isolated_policy(name: str) -> type[IsolatedPolicy]:
     """Return the class that stands for the policy of a name, such as "policy.py:MyPolicy".
 
     Raises:
-        RegistryError: it cannot be imported, which is tried in a process of its own; or it ships with wiw.
+        RegistryError: it cannot be imported, which is tried in a separate process; or it ships with wiw.
     """
     if not POLICIES.is_foreign(name):
         raise RegistryError(f"isolated: expected a policy of your own, as isolated:path.py:Class, got '{name}'")
@@ -64,7 +64,7 @@ class _MemoryHandle:
 
 
 class IsolatedPolicy(Isolated, Policy):
-    """Stands for a policy in a process of its own.
+    """Stands for a policy in a separate process.
 
     A call that fails or is late loses all memories: its episodes end with errors, or begin anew.
 

@@ -80,7 +80,7 @@ class Source:
 
 
 class Isolated:
-    """Base of what stands for a part in a process of its own; where that has ended, another one is begun.
+    """Base of what stands for a part in a separate process; if that has ended, another one is started.
 
     Args:
         memory_gb: most gigabytes of memory that a process may take, without those that it starts; three quarters of

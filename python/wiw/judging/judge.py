@@ -153,7 +153,7 @@ class TieredJudge(Judge):
 
     @property
     def concurrency(self) -> int:
-        """Most answers judged at a time, by the judge that takes most."""
+        """Maximum number of answers judged at the same time, over the judges."""
         return max(tier.concurrency for tier in self.tiers)
 
     def can_judge(self, reference: Reference) -> bool:

@@ -122,7 +122,7 @@ def read_counts(text: str) -> list[int]:
 
 
 def read_polarity(text: str, question: str = "") -> bool | None:
-    """Return whether an answer says yes; None where it says neither, or both.
+    """Return whether an answer says yes; None if it says neither, or both.
 
     Args:
         text: such as "yes", "No, there are no chairs", or with a question "it is shut".
@@ -153,7 +153,7 @@ def _says_yes_and_no(words: Sequence[str]) -> bool:
 
 
 def _compare_statement(text: str, question: str, negated: bool) -> bool | None:
-    """Return whether a statement agrees with a question; None where they are about different things."""
+    """Return whether a statement agrees with a question; None if they are about different things."""
     vocabulary = load_vocabulary()
     asked, said = split_words(question), split_words(text)
     for one, other in _OPPOSITES:

@@ -40,7 +40,7 @@ OPPOSITE_STATES = {
     "unmade": "made",
 }
 Rule = Callable[[str, str, str], "int | None"]
-"""(question, right answer, answer) to the mark; None where the right answer is beyond the rule."""
+"""(question, right answer, answer) to the mark; None if the right answer is beyond the rule."""
 
 
 class RuleJudge(Judge):

@@ -1,13 +1,13 @@
 # SPDX-License-Identifier: Apache-2.0
 """Asking a world model until it answers as agreed: a few tries a call, each within a deadline.
 
-A call that outlives its deadline is abandoned, for Python cannot end a thread: it goes on until it returns by itself or
-the process ends, with its memory, and on a GPU with its place in the queue. The next try waits once more for it, so
+A call that outlives its deadline is abandoned, for Python cannot end a thread: it continues until it returns by itself
+or the process ends, with its memory, and on a GPU with its place in the queue. The next try waits once more for it, so
 that a model that is merely slow is never entered twice at a time; then it asks in a new thread, which mends a lost
 request to a server. A GPU kernel that never ends lets every try pass its deadline, and the episode fails. Compiled code
 that hangs while it holds Python's lock stops the process: nothing in it can look at a clock.
 
-A model in a process of its own (`wiw.isolation`) is asked in the caller's thread: where it is late, its process is
+A model in a separate process (`wiw.isolation`) is asked in the caller's thread: where it is late, its process is
 killed, and the next try finds a new one.
 
 A model cannot end the process: `sys.exit()` in it is an error of its own like any exception. Threads that it starts in

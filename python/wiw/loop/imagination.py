@@ -71,7 +71,7 @@ class Imagination(ABC):
     """(height, width) that a model of a range of sizes was asked for; None of a model of one size."""
     pose_errors: Sequence[NDArray[np.float64] | None] | None = None
     """float64 [M, 2] by episode, metres and degrees: how far from their places each plan's frames were taken, in the
-    mean; NaN for a plan without imagined frames. None where nobody knows, as for most models."""
+    mean; NaN for a plan without imagined frames. None if nobody knows, as for most models."""
 
     @abstractmethod
     def show(self, frames: FrameSpec) -> list[list[Rollout]]:

@@ -35,7 +35,7 @@ class Primitives(PlanSpace):
         return plan.astype(np.int8)
 
     def check_model(self, model: WorldModel, longest: int) -> None:
-        """See `PlanSpace.check_model`; a model that needs more than an image cannot go on from an imagined frame."""
+        """See `PlanSpace.check_model`; a model that needs more than an image cannot continue from an imagined frame."""
         accepts, name = model.accepts, type(model.unwrapped).__name__
         check_plan_space(model, PRIMITIVES, self.words)
         check_needs(model)

@@ -30,9 +30,9 @@ class Track:
     """A target in the K frames of one imagined plan."""
 
     masks: NDArray[np.bool_]
-    """bool [K, H, W], in the frames' size; empty where the target is lost."""
+    """bool [K, H, W], in the frames' size; empty if the target is lost."""
     boxes: tuple[Box | None, ...]
-    """K boxes in the frames' pixels, None where the target is lost; across a panorama's seam left > right."""
+    """K boxes in the frames' pixels, None if the target is lost; across a panorama's seam left > right."""
 
     @property
     def visible(self) -> NDArray[np.bool_]:

@@ -107,7 +107,7 @@ def _plot_rollouts(part: Part) -> Markup:
 
 
 def group_pairs(differences: Sequence[Difference]) -> Group | None:
-    """Return the compared pairs as one table; None where nothing is compared."""
+    """Return the compared pairs as one table; None if nothing is compared."""
     rows: dict[str, dict[str, Difference]] = {}
     for each in differences:
         rows.setdefault(f"{each.arm} - {each.base}", {})[each.metric] = each
@@ -115,7 +115,7 @@ def group_pairs(differences: Sequence[Difference]) -> Group | None:
 
 
 def _list_quality(table: QualityTable | None) -> dict[str, Any] | None:
-    """Return the table of quality and controllability, with notes; None where it was not measured."""
+    """Return the table of quality and controllability, with notes; None if it was not measured."""
     if table is None:
         return None
     titles, rows = arm_rows(table)

@@ -19,7 +19,7 @@ class ArmText:
     """The parts of an arm's text."""
 
     name: str | None
-    """None where the arm is named by its policy and model."""
+    """None if the arm is named by its policy and model."""
     model: str
     """With what stands before it: a policy and "+", or the kind of a placebo."""
     options: tuple[str, ...] = ()

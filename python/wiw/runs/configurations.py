@@ -17,10 +17,10 @@ def drop_new_arms(stored: dict[str, Any], wanted: dict[str, Any]) -> dict[str, A
 
 
 def require_same(path: Path, stored: dict[str, Any], wanted: dict[str, Any]) -> None:
-    """Check that a run at `path` was begun with the wanted configuration.
+    """Check that a run at `path` was started with the wanted configuration.
 
     Raises:
-        StoreError: it was begun with another; says in what they differ.
+        StoreError: it was started with another; says in what they differ.
     """
     if stored == wanted:
         return

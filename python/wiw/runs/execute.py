@@ -22,7 +22,7 @@ from wiw.types import Episode, EpisodeResult
 
 
 class Look(Protocol):
-    """Findings of a look at a run that goes on; its string form is a sentence."""
+    """Findings of a look at a run that continues; its string form is a sentence."""
 
     @property
     def is_enough(self) -> bool:
@@ -47,7 +47,7 @@ def read_recipes(store: RunStore) -> tuple[TaskRecipe, dict[str, AgentRecipe]]:
     """Return the recipes of a run's task and agents.
 
     Raises:
-        StoreError: the run was begun with objects that existed only in memory.
+        StoreError: the run was started with objects that existed only in memory.
     """
     info = store.info
     if info["task"] is None or None in info["agents"].values():
@@ -77,7 +77,7 @@ def require_own_sources(store: RunStore, task: Any, agents: Mapping[str, Any]) -
 
 
 def update_own_sources(store: RunStore, task: Any, agents: Mapping[str, Any]) -> None:
-    """Store the user's own source files as they are now, before a run goes on; close the store where it must not.
+    """Store the user's own source files as they are now, before a run continues; close the store where it must not.
 
     Files that no ended episode was run with may have changed: a model that could not be made is mended, and the run
     resumes.

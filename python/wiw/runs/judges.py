@@ -71,7 +71,7 @@ class JudgedRow:
     metrics: Mapping[str, float]
     details: Mapping[str, Any]
     error: str = ""
-    """Why there are no marks; empty where there are."""
+    """Why there are no marks; empty if there are."""
     kind: str = ""
 
     @property

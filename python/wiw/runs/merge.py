@@ -181,7 +181,7 @@ def _choose_sources(parts: Sequence[RunStore]) -> tuple[list[set[Key]], int, lis
 def _find_difference(
     parts: Sequence[RunStore], first: tuple[int, Mapping[str, Any]], other: tuple[int, Mapping[str, Any]]
 ) -> str:
-    """Return the first difference between two records of an episode; empty where they are equal.
+    """Return the first difference between two records of an episode; empty if they are equal.
 
     Raises:
         StoreError: they differ although equality is guaranteed.

@@ -20,7 +20,7 @@ class ArmProgress:
     total: int
     """Episodes of the arm, those included that ended before this process began."""
     decisions_each: int = 1
-    """Most decisions an episode may take; ends early where the goal is reached."""
+    """Maximum number of decisions an episode may take; ends early where the goal is reached."""
     ended: int = 0
     errors: int = 0
     successes: float = 0.0

@@ -42,7 +42,7 @@ from wiw.runs.workers import (
 from wiw.types import Episode, EpisodeResult
 
 TRIES = 3
-"""How often an episode is begun whose actor, or whose server, is lost."""
+"""How often an episode is started if its actor or server is lost."""
 UNREACHABLE = ("connection", "unreachable")
 """Kinds of errors that say that a server was lost, of world models and of language models."""
 TOGETHER = 0.02

@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """Servers of a run as Ray actors: each starts `wiw serve` or `wiw serve-vlm`, and one that is lost is started again.
 
-An actor gets its GPUs of Ray and starts the command as a process of its own, which ends with the actor; a server that
+An actor gets its GPUs of Ray and starts the command as a separate process, which ends with the actor; a server that
 crashes takes nothing else with it. A server comes back at its address where its node is still there, and clients repeat
 what it has not answered; at another address the run's workers are told the new one.
 """

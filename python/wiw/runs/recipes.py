@@ -325,7 +325,7 @@ def _unwrap(part: Any) -> Any:
 
 
 def find_control(model: Any) -> str:
-    """Return how a world model, or one of that name, is told plans; empty where only the model itself can say."""
+    """Return how a world model, or one of that name, is told plans; empty if only the model itself can say."""
     found = WORLD_MODELS.find(model) if isinstance(model, str) else model
     return str(getattr(getattr(found, "accepts", None), "control", ""))
 

@@ -19,7 +19,8 @@ from wiw.types import Answer, ArmObservation, DecisionRecord, Episode, EpisodeRe
 STRIP_HEIGHT = 160
 JPEG_QUALITY = 85
 MOST_FRAMES = 20
-"""Most frames of a rollout that are kept as pictures: a JPEG has room for 65535 pixels, a reader for fewer."""
+"""Maximum number of frames of a rollout that are kept as pictures: a JPEG has room for 65535 pixels, a reader for
+fewer."""
 
 
 @dataclass(frozen=True)

@@ -348,7 +348,7 @@ class RunStore:
 
     @property
     def salt(self) -> str:
-        """The salt of keys and seeds (`wiw.loop.keys`); empty for a run that was begun without one."""
+        """The salt of keys and seeds (`wiw.loop.keys`); empty for a run that was started without one."""
         return str(self.info.get("salt", ""))
 
     @property
@@ -459,7 +459,7 @@ class RunStore:
     def count_answers(self) -> dict[str, dict[str, int]]:
         """Return by arm how many answers of a language model ended episodes have, by their problem's kind.
 
-        The kind is empty where an answer could be used. An arm that asked nothing is left out.
+        The kind is empty if an answer could be used. An arm that asked nothing is left out.
         """
         found: dict[str, dict[str, int]] = {}
         problem = "json_extract(e.value, '$.problem')"
@@ -479,7 +479,7 @@ class RunStore:
         return found
 
     def images(self, arm: str, episode: int, decision: int) -> dict[str, bytes]:
-        """Return JPEG by name, empty where no pictures were kept."""
+        """Return JPEG by name, empty if no pictures were kept."""
         rows = self._rows(
             "SELECT name, jpeg FROM image WHERE arm = ? AND episode = ? AND decision = ? ORDER BY name",
             (arm, episode, decision),
@@ -585,7 +585,7 @@ class RunStore:
         """Store the description of an arm's agent as `info["built"][arm]`.
 
         Raises:
-            StoreError: the arm was begun with an agent that said otherwise, such as one of other weights.
+            StoreError: the arm was started with an agent that said otherwise, such as one of other weights.
         """
         info = self.info
         agent = json.loads(to_json(row.agent))
@@ -625,7 +625,7 @@ class RunStore:
             )
 
     def change_settings(self, changes: Mapping[str, Any]) -> None:
-        """Store settings that the run goes on with; `info["resumed_with"]` lists what was changed, and when."""
+        """Store settings that the run continues with; `info["resumed_with"]` lists what was changed, and when."""
         info = self.info
         own = {**info["limits"], "live": info["live"]}
         changed = {name: value for name, value in changes.items() if name not in own or own[name] != value}
@@ -807,7 +807,7 @@ class RunStore:
 
 @contextmanager
 def leave_resumable(begun: RunStore) -> Iterator[None]:
-    """Where an error ends the work on a new run, note on it how the run goes on, or remove one without any record.
+    """Where an error ends the work on a new run, note on it how the run continues, or remove one without any record.
 
     So a wrong token or missing weights leave no run behind that can neither be begun again nor resumed. An
     interruption leaves it.

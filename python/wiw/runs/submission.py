@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """Submit commands as cluster jobs through submitit: one array, each element a command that can be run by hand.
 
-A job is this module's `JobCommand`, which starts the command as a process of its own. Before the time limit, and when
+A job is this module's `JobCommand`, which starts the command as a separate process. Before the time limit, and when
 it is preempted with a warning, SLURM sends SIGUSR2: the command stops, everything recorded, and submitit requeues the
 job. At SIGTERM the command stops likewise; `--requeue` lets SLURM itself start the job again where it was preempted,
 and not where it was cancelled.

@@ -35,7 +35,7 @@ Row = RestartRow | AgentRow | DecisionRow | LostRow | OutcomeRow
 _RESEED = 0x52455345
 """Keeps the seeds of arms that repeat another apart from all other draws."""
 TRIES = 2
-"""Times that an episode is begun whose worker dies."""
+"""How often an episode is started if its worker dies."""
 NUMBERS = {2: "twice", 3: "three times"}
 
 
@@ -274,7 +274,7 @@ def lease_again(
         job: that the worker had.
         unfinished: its episodes that have not ended, by index.
         receiver: discards what it was told of them, and records errors.
-        tries: how often an episode is begun.
+        tries: how often an episode is started.
         cause: why the worker was lost.
     """
     receiver.discard(job.arm, list(unfinished))

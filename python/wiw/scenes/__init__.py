@@ -77,7 +77,7 @@ def load(
             layout). The rule that was used is `scene.attributes["up"]`.
         ceiling: closes a scene that is open above, in metres above its floor.
         cache: keep the imported scene on disk (`$WIW_CACHE` or `~/.cache/wiw`) and map it the next time.
-        isolate: import in a process of its own, so that a file that crashes the reader raises FileError here.
+        isolate: import in a separate process, so that a file that crashes the reader raises FileError here.
         limits: raises or lowers the import limits: file_bytes, triangles, nodes, texture_pixels, texture_bytes.
         texture_folders: searched for textures by base name, after the places beside the file.
         model_folders: searched for `model://` of a world, before the places beside the file.

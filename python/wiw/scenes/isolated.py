@@ -2,8 +2,8 @@
 """Read untrusted files in a child process.
 
 Readers of 3D formats are large programs that trust their input: a damaged file can make one crash, hang or eat all
-memory. In a child process each of these becomes a FileError, and a run of many scenes goes on. The child ends with its
-parent, and has limits of time and memory of its own.
+memory. In a child process each of these becomes a FileError, and a run of many scenes continues. The child ends with
+its parent, and has limits of time and memory of its own.
 """
 
 from __future__ import annotations

@@ -163,7 +163,7 @@ def _open_lock(name: Path) -> IO[str] | None:
 
 
 def _map_scene(path: Path) -> _core.scene.Scene | None:
-    """Map the scene kept at `path` and mark it as used; None where there is none or, with a warning, a damaged one."""
+    """Map the scene kept at `path` and mark it as used; None if there is none or, with a warning, a damaged one."""
     if not path.exists():
         return None
     try:

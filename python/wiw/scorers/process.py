@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""A scorer in a process of its own: any command, in any language, under any licence.
+"""A scorer in a separate process: any command, in any language, under any licence.
 
 The command is started once, without a shell. Its first line on the standard output says who it is:
 

@@ -11,7 +11,7 @@ from pathlib import Path
 from typing import Any, Protocol
 
 Range = tuple[float, float] | None
-"""Smallest and largest score, or None where a score has no bounds."""
+"""Smallest and largest score, or None if a score has no bounds."""
 
 
 @dataclass(frozen=True)

@@ -38,9 +38,9 @@ from wiw.world_models.remote.limits import check_row, most_bytes
 
 PORT = 8765
 CLIENTS = 256
-"""Most connections at a time."""
+"""Maximum number of connections at a time."""
 KNOWN_BYTES = 512 * 2**20
-"""Most bytes of answers that are kept for clients that ask again."""
+"""Maximum size in bytes of answers kept for clients that ask again."""
 AHEAD = 4
 """Full batches that one client may have unanswered, so that rows travel while others are computed."""
 HEARTBEAT, SILENCE, HANDSHAKE = 10.0, 30.0, 10.0

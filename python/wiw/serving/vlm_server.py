@@ -23,7 +23,7 @@ from wiw.vlm.images import from_data_uri
 from wiw.vlm.messages import Call, Completion, Message, Part
 
 MOST_BYTES = 256 << 20
-"""Most bytes of a request's body."""
+"""Maximum size of a request's body in bytes."""
 UNCLEAR = (Error, ValueError, LookupError, TypeError, AttributeError, OverflowError, RecursionError)
 """What a request that makes no sense raises; anything else is a fault of the model or script behind the server."""
 

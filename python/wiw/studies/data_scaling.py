@@ -261,7 +261,7 @@ def _group_by_setting(measures: Mapping[Training, Measures]) -> dict[str, list[M
 def _run_imagenav(
     jobs: Sequence[TrainingJob], plan: ScalingPlan, folder: Path, episodes: int, workers: int
 ) -> list[Success]:
-    """Run the models of the first seed in closed loop on the same episodes, or go on with that."""
+    """Run the models of the first seed in closed loop on the same episodes, or continue with that."""
     from wiw.loop.agent import Agent
     from wiw.studies.evaluate import evaluate
 

@@ -68,7 +68,7 @@ class StudyRun:
     """Arms, each with the one that it is compared with."""
     plots: tuple[str, ...] = ("success",)
     quality: Mapping[str, Any] | None = None
-    """Options of `wiw.quality`; None where it is not asked for."""
+    """Options of `wiw.quality`; None if it is not asked for."""
 
 
 @dataclass(frozen=True)

@@ -43,7 +43,7 @@ PALETTE: Mapping[str, tuple[float, float, float]] = {
 DOWN = (np.pi, 0.0, 0.0)
 """Roll, pitch, yaw of a hand that points down."""
 REACH = ((0.02, -0.28), (0.32, 0.28))
-"""Least and greatest x and y of where things are put, within easy reach of the arm."""
+"""Minimum and maximum x and y of where things are put, within easy reach of the arm."""
 
 GRASP_OPENING = (0.02, 0.5)
 """Range of the gripper's opening that means it holds a wall: between closed on nothing and not closed."""
@@ -108,7 +108,7 @@ class TabletopTask(ABC):
         """Return the other targets that the same objects allow."""
 
     def find_remaining_target(self, observation: ArmObservation, target: Any) -> Any:
-        """Return what remains to be done of a target; None where nothing remains, or nothing helps."""
+        """Return what remains to be done of a target; None if nothing remains, or nothing helps."""
         return target
 
     @abstractmethod

@@ -29,7 +29,7 @@ from wiw.tasks.navigation import NavigationTask
 from wiw.types import Episode, Goal, TableSpec, TextAnswer, Wording
 
 HALF_TURN = 8
-"""Most primitives of a turn: 22.5 degrees each, the shorter way round."""
+"""Maximum number of primitives of a turn: 22.5 degrees each, the shorter way round."""
 SEEN = 0.008
 """Steradians of a thing in view that count as having seen it: .3 % of a view with 105 degrees across."""
 
@@ -45,7 +45,7 @@ class AEQARules:
     horizon: int
     """L, actions per plan, where the turn that a plan begins with counts as one, whatever its angle."""
     execute: int
-    """Most primitives carried out before the next decision."""
+    """Maximum number of primitives carried out before the next decision."""
     confirm: Literal["next_view", "same_view", "none"]
     """When a final answer ends the episode: given again after the next segment, given again at once on the same view
     (nothing is carried out in between), or the first time."""
@@ -103,12 +103,12 @@ class AEQA(NavigationTask):
 
     @property
     def limit(self) -> int:
-        """Most primitives of an episode."""
+        """Maximum number of primitives of an episode."""
         return int(self.rules.actions)
 
     @property
     def budget(self) -> int:
-        """Most primitives of an episode."""
+        """Maximum number of primitives of an episode."""
         return self.limit
 
     @property
@@ -272,7 +272,7 @@ class AEQA(NavigationTask):
 
     @classmethod
     def read_answers(cls, task: Mapping[str, Any], episode: Episode, outcome: Mapping[str, Any]) -> AnswerRecord | None:
-        """Return the answers of a stored outcome; None where it has none because something other than a judge broke.
+        """Return the answers of a stored outcome; None if it has none because something other than a judge broke.
 
         Raises:
             StoreError: the outcome lacks what its marks are computed from.

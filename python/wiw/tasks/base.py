@@ -115,7 +115,7 @@ class Task(ABC):
 
     @property
     def file_header(self) -> dict[str, Any] | None:
-        """Header of a file of its episodes (`wiw episodes`); None where episodes are not kept in files."""
+        """Header of a file of its episodes (`wiw episodes`); None if episodes are not kept in files."""
         return None
 
     @staticmethod
@@ -145,7 +145,7 @@ class Task(ABC):
         """Check that all that episodes need is there, without loading any of it.
 
         Returns:
-            For each scene, what it is used with, which must not change while a run goes on.
+            For each scene, what it is used with, which must not change while a run continues.
 
         Raises:
             FileError: something is not there.
@@ -158,7 +158,7 @@ class Task(ABC):
 
     @classmethod
     def read_answers(cls, task: Mapping[str, Any], episode: Episode, outcome: Mapping[str, Any]) -> AnswerRecord | None:
-        """Return the answers of a stored outcome, so that they can be judged again; None where it has none.
+        """Return the answers of a stored outcome, so that they can be judged again; None if it has none.
 
         Args:
             task: what the task of the run says of itself (`describe`).

@@ -66,7 +66,7 @@ class Checkpoint:
         return cls(out.with_name(f"{out.name}.checkpoint"), identity)
 
     def load(self) -> TrainingState | None:
-        """Read the file; None where there is none.
+        """Read the file; None if there is none.
 
         Raises:
             ArgumentError: it belongs to another training.

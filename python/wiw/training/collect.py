@@ -93,7 +93,7 @@ class _Job:
     collection: Collection
 
     def read_failed_count(self) -> int | None:
-        """Return the number of tables failed at, as the file says; None where the file is absent or damaged."""
+        """Return the number of tables failed at, as the file says; None if the file is absent or damaged."""
         try:
             return int(shards.Shard(self.path).facts["failed"])
         except FileError:

@@ -183,7 +183,7 @@ class SceneJob:
     options: NavigationCollection
 
     def read_record(self) -> dict[str, Any] | None:
-        """Return what is known about the finished pass; None where it is not finished or its files are not whole."""
+        """Return what is known about the finished pass; None if it is not finished or its files are not whole."""
         try:
             record: dict[str, Any] = json.loads(self._record_path.read_text())
             sizes = [(self.folder / name).stat().st_size == file["bytes"] for name, file in record["files"].items()]

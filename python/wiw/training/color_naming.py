@@ -69,7 +69,7 @@ def evaluate(namer: ColorNamer, views: LabelledViews) -> dict[str, Any]:
 
     Returns:
         {"things": N, "accuracy": of things in rooms, "structure": of walls, floors and the like, "by_category",
-        "by_color"}: shares of the sets of pixels whose colour was named as the scene names it, None where there are
+        "by_color"}: shares of the sets of pixels whose colour was named as the scene names it, None if there are
         none.
     """
     if not len(views.pixels):

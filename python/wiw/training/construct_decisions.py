@@ -39,9 +39,9 @@ class DecisionRules:
     plans: int = 6
     """Plans of a decision."""
     actions: int = 13
-    """Most actions of a plan: those of a clip of 14 frames."""
+    """Maximum number of actions in a plan: those of a clip of 14 frames."""
     least_steps: int = 2
-    """Least steps ahead of a plan."""
+    """Minimum number of steps ahead in a plan."""
     goal_shortest: float = 0.8
     goal_longest: float = 2.2
     size: tuple[int, int] = (64, 128)
@@ -106,7 +106,7 @@ class _Decision:
 
 
 def _construct(world: World, path: StraightPath, draws: np.random.Generator, rules: DecisionRules) -> _Decision | None:
-    """Return plans and places of a decision towards the end of a path; None where too few ways are free."""
+    """Return plans and places of a decision towards the end of a path; None if too few ways are free."""
     length = draws.uniform(rules.goal_shortest, max(path.length, rules.goal_shortest))
     yaw = path.heading + draws.uniform(0, 2 * np.pi)
     turns = draws.permutation(np.arange(-HEADINGS // 2 + 1, HEADINGS // 2 + 1))

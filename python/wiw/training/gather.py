@@ -254,7 +254,7 @@ class _FileJob:
 
 
 def _read_file(file: Path, job: Job) -> Arrays | None:
-    """Return the arrays of a cache file; None where it is absent or incomplete."""
+    """Return the arrays of a cache file; None if it is absent or incomplete."""
     try:
         with np.load(file) as values:
             return {name: values[name] for name in job.fields}

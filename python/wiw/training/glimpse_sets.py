@@ -38,12 +38,12 @@ class GlimpseSetRules:
 
     places: int = 8
     targets: int = 5
-    """Most objects observed from a place; those of rare categories come first."""
+    """Maximum number of objects observed from a place; those of rare categories come first."""
     neighbours: int = 3
     reach: tuple[float, float] = (0.25, 1.6)
-    """Least and greatest distance of the neighbours; the second is the length of eight steps."""
+    """Minimum and maximum distance of the neighbours; the second is the length of eight steps."""
     smallest: float = 0.0015
-    """Least solid angle of a target in steradians, 45 pixels of the panorama."""
+    """Minimum solid angle of a target in steradians, 45 pixels of the panorama."""
     survey: int = 150
     """Number of candidate places."""
     reshape: float = 1.25

@@ -38,7 +38,7 @@ class PlaceRules:
     anchors: int = 24
     """Places all over the scene."""
     neighbours: int = 3
-    """Most places near each of those."""
+    """Maximum number of places near each of these."""
     reach: float = 2.0
     """Greatest distance of the near ones."""
 

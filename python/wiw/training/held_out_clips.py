@@ -102,7 +102,7 @@ class HeldOutClips(ABC, Generic[Errors]):
 
     @property
     def view(self) -> ShownView | None:
-        """View in which models of such clips see stored decisions; None where no agent moves."""
+        """View in which models of such clips see stored decisions; None if no agent moves."""
         return None
 
     def observe(self, rows: slice) -> Conditioning:

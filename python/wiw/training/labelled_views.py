@@ -32,7 +32,7 @@ is open, so that the network learns to look at how much of the window shows.
 COLOR_SAMPLES = 64
 """Pixels stored of an instance in a view, for learning colour names."""
 CLOSE = (0.7, 2.2)
-"""Least and greatest horizontal distance in metres of a close place from the middle of its thing."""
+"""Minimum and maximum horizontal distance in metres of a close place from the middle of its thing."""
 CANDIDATES = 2000
 """Places from which close ones are chosen."""
 LEAST_PIXELS = 150
@@ -55,7 +55,7 @@ class ViewRules:
     views: int = 3
     """Views of a place, in directions spread evenly around it."""
     fields: tuple[float, float] = (90.0, 110.0)
-    """Least and greatest horizontal field of view in degrees."""
+    """Minimum and maximum horizontal field of view in degrees."""
 
 
 @dataclass(frozen=True)

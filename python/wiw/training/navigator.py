@@ -318,7 +318,7 @@ def evaluate(
     Returns:
         {"pairs": N, "auc": {"network": ..., "similarity": ..., "both": ...}, "bearing": {"0.3-2": {"network": ...,
         "similarity": ..., "within_45": ..., "pairs": ...}, ...}}: the probability that a pair within 2 m is rated
-        nearer than one that is farther apart (None where all pairs are near, or none), and median errors of the bearing
+        nearer than one that is farther apart (None if all pairs are near, or none), and median errors of the bearing
         in degrees by range of distance.
 
     Raises:

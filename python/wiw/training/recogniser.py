@@ -23,7 +23,7 @@ from wiw.training.trainer import run_training, warmup_cosine_schedule
 REAL_COLUMN = 4
 """Column of `Glimpses.scalars` that marks real glimpses."""
 MAX_EXTRA_GLIMPSES = 4
-"""Most glimpses of a set that training adds to the first."""
+"""Maximum number of glimpses of a set that training adds to the first."""
 CONFUSION_RATE = 0.05
 """Share by which a batch changes the running confusion of categories."""
 
@@ -75,7 +75,7 @@ def train(
         recipe: how to train; see `Recipe`.
         minutes: if given, reduces the number of epochs so that training takes about this long.
         on_step: called after each step with its number, the number of all steps and a running mean of the loss.
-        start: network of the same categories and width whose training goes on; None for a new one.
+        start: network of the same categories and width whose training continues; None for a new one.
 
     Raises:
         ArgumentError: `start` has other categories or another width.

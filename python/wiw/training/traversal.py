@@ -284,7 +284,7 @@ class Follower:
         return [*kept, *((nearest + offset) % HEADINGS for offset in offsets)]
 
     def _step_end(self, heading: int, start: NDArray[np.float32] | None = None) -> NDArray[np.float32] | None:
-        """Return where a step forward leads, by the rule of environments: None where its end is off the mesh."""
+        """Return where a step forward leads, by the rule of environments: None if its end is off the mesh."""
         yaw = self.north + heading * TURN_RAD
         position = self.position if start is None else start
         end = (position.astype(np.float64) + STEP_M * np.array([-np.sin(yaw), 0, -np.cos(yaw)])).astype(np.float32)

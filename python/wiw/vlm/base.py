@@ -34,7 +34,7 @@ class Client(ABC):
     """
 
     concurrency: int = 1
-    """Most requests at a time."""
+    """Maximum number of requests at a time."""
 
     def __init__(
         self,

@@ -59,7 +59,7 @@ class ReplyCache:
         return ReplyCache, (self.folder, self.budget_gb)
 
     def get(self, name: str) -> Completion | None:
-        """Return the answer of that name; None where there is none."""
+        """Return the answer of that name; None if there is none."""
         if self._broken or not (self.folder / "replies.sqlite").exists():
             return None
         try:

@@ -15,7 +15,7 @@ from wiw.vlm import choices, structured
 from wiw.vlm.messages import Call, Completion, CompletionRecord, Problem, Reply, Request
 
 RETRY_TEMPERATURE = 0.7
-"""Least temperature of a repeated question: at 0 the same answer would come."""
+"""Minimum temperature of a repeated question: at 0 the same answer would come."""
 VOTE_TOKENS = 8
 Talk = Generator[list[Call], list[Completion], Reply]
 

@@ -52,7 +52,7 @@ class Request:
     exact_seed: bool = False
     """Whether the first call for text or JSON has `seed` itself, as a published protocol may ask for."""
     max_tokens: int = 1024
-    """Most tokens of an answer that is not a choice."""
+    """Maximum number of tokens of an answer that is not a choice."""
     tries: int = 3
     """Times that it is asked before an unusable answer counts as the outcome."""
 
@@ -89,7 +89,7 @@ class Completion:
     finish: str = "stop"
     """"stop", "length", "refusal", "huge", or the server's own word."""
     logprobs: tuple[tuple[str, float], ...] | None = None
-    """Likeliest first tokens; None where the server returns none."""
+    """Likeliest first tokens; None if the server returns none."""
     prompt_tokens: int = 0
     completion_tokens: int = 0
     retries: int = 0

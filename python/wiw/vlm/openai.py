@@ -23,7 +23,7 @@ from wiw.vlm.messages import Call, Completion, Message
 Dialect = Literal["openai", "vllm", "legacy"]
 DIALECTS = ("openai", "vllm", "legacy")
 MOST_BYTES = 4 << 20
-"""Most bytes of a reply's body; what goes beyond is not read."""
+"""Maximum size of a reply's body in bytes; what goes beyond is not read."""
 MOST_OF_AN_ERROR = 1 << 16
 """Bytes of an error's body that are read."""
 LONGEST_WAIT = 60.0
@@ -366,7 +366,7 @@ def _clean(text: str) -> str:
 
 
 def _first_token(logprobs: Any) -> tuple[tuple[str, float], ...] | None:
-    """Return the likeliest first tokens; None where the server lists none."""
+    """Return the likeliest first tokens; None if the server lists none."""
     tokens = (logprobs or {}).get("content") or []
     listed = tokens[0].get("top_logprobs") or [] if tokens else []
     pairs = tuple((_clean(str(each["token"])), float(each["logprob"])) for each in listed)

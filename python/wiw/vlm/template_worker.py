@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Templates in Jinja's sandbox, and a process of its own that fills a user's within bounds (`python FILE`).
+"""Templates in Jinja's sandbox, and a separate process that fills a user's within bounds (`python FILE`).
 
 The sandbox keeps a template from the rest of the program, but not from taking all time or memory, and a single
 expression can do that inside compiled code. So the process has the kernel's limits. It reads pickled jobs from its
@@ -25,7 +25,7 @@ SECONDS = 2.0
 MEMORY = 256 << 20
 """Bytes of address space."""
 CHARACTERS = 1 << 20
-"""Most characters of one prompt."""
+"""Maximum number of characters of one prompt."""
 ENVIRONMENT = SandboxedEnvironment(undefined=StrictUndefined, trim_blocks=True, lstrip_blocks=True)
 
 

@@ -27,7 +27,7 @@ from wiw.wire.arrays import pack_array, unpack_array
 
 VERSION = 1
 MOST_BYTES = 256 * 2**20
-"""Most bytes of a message, in either direction; a server takes no more than a row of its model needs."""
+"""Maximum size of a message in bytes, in either direction; a server takes no more than a row of its model needs."""
 MOST_ITEMS = 32
 """Most items of any map or list, and of maps and lists in a message: unpacked they take many times the bytes that they
 came in, and msgpack makes room for as many items as are declared."""
@@ -53,7 +53,7 @@ class Welcome:
     unknown: str
     """Why it is empty."""
     in_flight: int
-    """Most rows of a client that may be unanswered at a time."""
+    """Maximum number of rows of a client that may be unanswered at a time."""
 
 
 @dataclass(frozen=True)

@@ -13,7 +13,7 @@ from wiw.world_models.base import Requirements
 
 
 def lacks(requires: Requirements) -> list[str]:
-    """List what is missing, in a few words each; empty where the model is ready."""
+    """List what is missing, in a few words each; empty if the model is ready."""
     packages = requires.missing()
     found = [f"{', '.join(packages)} (pip install 'wiw[{requires.extra}]')"] if packages else []
     if requires.served and not is_served(requires.served, requires.server):

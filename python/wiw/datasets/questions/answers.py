@@ -126,7 +126,7 @@ def resemblance(guess: str, fact: Fact, answer_type: str) -> float:
 
 
 def find_answer(table: SceneTable, template: str, slots: Slots) -> Fact | None:
-    """Return what is true of a question in a scene, or None where it has no answer, or more than one."""
+    """Return what is true of a question in a scene, or None if it has no answer, or more than one."""
     if "room" in slots and (table.find_room(slots["room"]) is None or _may_be_elsewhere(table, slots)):
         return None
     fact = _ANSWERS[template](table, slots)

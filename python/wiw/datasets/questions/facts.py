@@ -118,7 +118,7 @@ class SceneTable:
         return kinds
 
     def find_room(self, kind: str) -> Room | None:
-        """Return the only room of a kind; None where there is none, or more than one."""
+        """Return the only room of a kind; None if there is none, or more than one."""
         rooms = self.room_kinds.get(kind, [])
         return rooms[0] if len(rooms) == 1 else None
 

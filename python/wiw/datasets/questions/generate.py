@@ -38,22 +38,22 @@ class EpisodeRules:
     """Rules that a question and its start satisfy. Lengths in metres."""
 
     shortest: float = 4.0
-    """Least L*, the walk from the start to the nearest place from which the question can be answered."""
+    """Minimum L*, the walk from the start to the nearest place from which the question can be answered."""
     longest: float = 15.0
     share: float = 0.003
-    """Least part of a view that target and anchor fill at such a place."""
+    """Minimum part of a view that target and anchor fill at such a place."""
     counted: float = 0.001
     """The same for each of several things that need not be in one view, such as those that are counted."""
     reach: float = 4.0
     """Greatest distance of such a place from the target."""
     clear: float = 0.5
-    """Least share of a thing's pixels that are rendered in the colour that a question speaks of."""
+    """Minimum share of a thing's pixels that are rendered in the colour that a question speaks of."""
     rooms: int = 6
-    """Least number of rooms of an apartment, passages included; there is nothing to explore in smaller ones."""
+    """Minimum number of rooms of an apartment, passages included; there is nothing to explore in smaller ones."""
     places: int = 320
     """Places looked at in a scene."""
     viewpoints: int = 24
-    """Most places that an episode names as those from which it can be answered."""
+    """Maximum number of places that an episode names as those from which it can be answered."""
     yes_no: float = 0.2
     """Greatest share of questions that are answered by yes or no; half of these by yes."""
     guessing: float = 0.2

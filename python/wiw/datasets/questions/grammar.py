@@ -218,7 +218,7 @@ def phrase(template: str, slots: Mapping[str, str]) -> str:
 
 
 def parse(text: str) -> ParsedQuestion | None:
-    """Return template and words of a text, or None where it is none of this language."""
+    """Return template and words of a text, or None if it is none of this language."""
     plain = " ".join(text.lower().split()).rstrip(" ?") + "?"
     for name, template in TEMPLATES.items():
         match = _regex(name).fullmatch(plain)

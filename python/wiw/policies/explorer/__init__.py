@@ -38,7 +38,7 @@ SURFACES = ("floor", "wall")
 SURFACE_STRIDE = 24
 """Pixels between the looks at floors and walls, along rows and columns."""
 LOOK_ACTIONS = 3
-"""Most primitives of a plan that only takes a second look."""
+"""Maximum number of primitives of a plan that only takes a second look."""
 MOST_GAIN = 12.0
 """Square metres of new floor that count at most: one room. More would draw an agent to and fro across a home."""
 LAST_ACTIONS = 18

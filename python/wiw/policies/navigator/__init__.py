@@ -60,7 +60,7 @@ class NavigatorOptions:
     trust: float = 0.7
     """Weight of an imagined place beside a real one."""
     spacing: float = 0.4
-    """Least metres between the imagined places of a plan, and between remembered ones and real ones."""
+    """Minimum metres between the imagined places of a plan, and between remembered ones and real ones."""
     patience: float = 12.0
     """Primitives after which an arrival is worth 1/e of one now."""
     commitment: float = 0.25
@@ -70,7 +70,7 @@ class NavigatorOptions:
     apart: float = 0.5
     """Metres between the ends of plans."""
     targets: int = 8
-    """Most places that routes are planned to."""
+    """Maximum number of places that routes are planned to."""
 
     def __post_init__(self) -> None:
         if min(self.patience, self.overlap) <= 0 or self.targets < 1 or min(vars(self).values()) < 0:

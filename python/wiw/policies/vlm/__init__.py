@@ -40,7 +40,7 @@ FALLBACK_SEED, _ANSWER_SEED, _MOVE_SEED, REVISION_SEED = 0x64726177, 0x616E7377,
 """Separate the seeds of a decision's questions."""
 FALLBACK_NOTE = "drawn: no answer could be used"
 MAX_PLAN_TOKENS = 1024
-"""Most tokens of a plan."""
+"""Maximum number of tokens of a plan."""
 ROLES = ("propose", "revise", "answer")
 """Sorts of questions that may go to different models."""
 MOVES = list(plans.PRIMITIVES.values())
@@ -51,7 +51,7 @@ class Memory:
     """The memory of one episode."""
 
     horizon: int = 1
-    """Most primitives, or poses, of a plan."""
+    """Maximum number of primitives, or poses, of a plan."""
     belief: NDArray[np.float64] | None = None
     """The last answer, as probabilities that sum to 1 ..."""
     raw_belief: NDArray[np.float64] | None = None

@@ -67,7 +67,7 @@ class Glb:
         return head + text + struct.pack("<II", len(body), _BIN) + body
 
     def items(self, name: str) -> list[Any]:
-        """Return a list of the document; empty where there is none."""
+        """Return a list of the document; empty if there is none."""
         return self.document.get(name, [])
 
     def view(self, index: int) -> memoryview:

@@ -243,7 +243,7 @@ def _vertex_colors(values: NDArray[Any]) -> NDArray[np.uint8]:
 
 
 def _picture(glb: Glb, primitive: dict[str, Any]) -> NDArray[np.uint8] | None:
-    """Return the texture of a part, uint8 [H, W, 3]; None where it has none."""
+    """Return the texture of a part, uint8 [H, W, 3]; None if it has none."""
     if "material" not in primitive:
         return None
     material = glb.items("materials")[primitive["material"]]

@@ -83,7 +83,7 @@ class Dataset:
         return Dataset(path, read_object(path), [path])
 
     def section(self, name: str) -> Mapping[str, Any]:
-        """Return a section, empty where there is none."""
+        """Return a section, empty if there is none."""
         found = self.body.get(name, {})
         return found if isinstance(found, Mapping) else {}
 
@@ -143,7 +143,7 @@ class Dataset:
 
     @cached_property
     def listed_names(self) -> dict[str, str]:
-        """Categories by template, from HSSD's `semantics/objects.csv`; empty where there is no such table."""
+        """Categories by template, from HSSD's `semantics/objects.csv`; empty if there is no such table."""
         file = self.path.parent / "semantics" / "objects.csv"
         if not file.is_file():
             return {}

@@ -15,7 +15,7 @@ from wiw.training.checkpoint import Checkpoint, ResumableTrainer, TrainingState
 from wiw.training.post_training import distributed
 
 STOPPING = (signal.SIGTERM, signal.SIGINT)
-"""Signals after which the training stops, once its state is written; after SIGUSR1 it goes on."""
+"""Signals after which the training stops, once its state is written; after SIGUSR1 it continues."""
 
 
 class SignalledCheckpoint(Checkpoint):
@@ -31,7 +31,7 @@ class SignalledCheckpoint(Checkpoint):
     _pending = 0
 
     def load(self) -> TrainingState | None:
-        """Read the file; None where there is none.
+        """Read the file; None if there is none.
 
         Raises:
             ArgumentError: it belongs to another training, or only some processes find it.

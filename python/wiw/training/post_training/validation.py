@@ -76,7 +76,7 @@ def find_held_out(
 ) -> Corpus | None:
     """Return what a training is validated on: another dataset, or the part that its own leaves out for it.
 
-    None where there is no validation.
+    None if there is no validation.
 
     Args:
         open_part: opens either.

@@ -10,7 +10,7 @@ from wiw.wire.rows import Row
 from wiw.world_models.base import Accepts
 
 CONTROL_BYTES = 2**20
-"""Most bytes of a row beside its images."""
+"""Maximum size of a row beside its images in bytes."""
 
 
 def most_bytes(accepts: Accepts) -> int:

@@ -110,11 +110,11 @@ class Remote(WorldModel):
         return frames
 
     def describe(self) -> dict[str, Any]:
-        """Return what is served, wherever that is: a run may go on with the same model at another address."""
+        """Return what is served, wherever that is: a run may continue with the same model at another address."""
         return {"name": "Remote", "model": self._described, "fingerprint": self._welcome.fingerprint or None}
 
     def fingerprint(self) -> str:
-        """Return the served model's own; empty where it declares no version."""
+        """Return the served model's own; empty if it declares no version."""
         return self._welcome.fingerprint
 
     def close(self) -> None:

@@ -41,7 +41,7 @@ class RunwayGen4(WorldModel):
         size: (height, width) of input and output, square and at most 960x960, which the service makes of it.
         frames: of a rollout, the observation included: the most actions that a clip is asked to show, and one more.
         batch: rows that are begun at once.
-        budget: credits after which nothing more is begun; None is without end.
+        budget: credits after which no more tasks are started; None means no limit.
         template, alignment: as of `TextVideoModel`; clips count as having `frames` frames.
         poll: seconds between two looks at the tasks.
         patience: seconds after which a task that has not ended counts as lost.

@@ -21,7 +21,7 @@ class Tasks:
         url: of the service; the SDK's own choice if None.
         poll: seconds between two looks.
         patience: seconds after which a task that has not ended counts as lost.
-        budget: credits after which nothing more is begun.
+        budget: credits after which no more tasks are started.
 
     Raises:
         ArgumentError: no key in the environment.

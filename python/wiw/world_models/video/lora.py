@@ -147,7 +147,7 @@ def _read_file(file: Path) -> tuple[dict[str, Any], dict[str, Any] | None]:
 
 
 def _select_metadata(metadata: Mapping[str, Any] | None, place: str) -> dict[str, Any] | None:
-    """Return what the file says of the denoiser's LoRA; None where it says nothing."""
+    """Return what the file says of the denoiser's LoRA; None if it says nothing."""
     prefixes = (f"{place}.", "transformer.")
     own = [
         {name.removeprefix(prefix): value for name, value in (metadata or {}).items() if name.startswith(prefix)}

@@ -90,7 +90,7 @@ class _Writer:
     closers: list[str] = field(default_factory=list)
     """Text to write where each open brace ends."""
     lists: list[int | None] = field(default_factory=list)
-    """For each list that is open: its latest number, or None where it has dashes."""
+    """For each list that is open: its latest number, or None if it has dashes."""
     pending: str | None = None
     """Mark of a command that waits for its argument."""
 

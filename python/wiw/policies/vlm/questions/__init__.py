@@ -45,7 +45,7 @@ class QuestionMemory(Memory):
     commands: dict[bytes, Command] = field(default_factory=dict)
     """Commands of the present decision by the plans that they became."""
     answer: tuple[Key, str] | None = None
-    """The planner's latest answer, empty where it gave none, and at which decision."""
+    """The planner's latest answer, empty if it gave none, and at which decision."""
     executed: int = 0
     """Primitives that had been executed at the latest observation."""
     history: list[str] = field(default_factory=list)
@@ -321,7 +321,7 @@ class QuestionVLM(VLM):
 
 
 def _get_answer(situation: Situation) -> str | None:
-    """Return the answer of this decision's planner, empty where it has none; None where it was not asked."""
+    """Return the answer of this decision's planner, empty if it has none; None if it was not asked."""
     latest = situation.memory.answer
     return None if latest is None or latest[0] != situation.key else latest[1]
 

@@ -20,9 +20,9 @@ VERSION = 1
 VIEW = (576, 1024)
 """Height and width of wiw's panoramas."""
 ITEMS = 32
-"""Most entries of a map or list, and most maps and lists of a message."""
+"""Maximum number of entries in a map or list, and of maps and lists in a message."""
 ACTIONS = 128
-"""Most of a row, so that its answer can be sent."""
+"""Maximum size of a row, so that its answer can be sent."""
 DTYPES = frozenset(("|b1", "|u1", "|i1", "<u2", "<i2", "<u4", "<i4", "<u8", "<i8", "<f4", "<f8"))
 MESSAGES: dict[str, dict[str, type]] = {
     "hello": {"software": str},

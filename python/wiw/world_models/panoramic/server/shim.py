@@ -41,7 +41,7 @@ IN_FLIGHT = 4
 QUEUE = 64
 """Rows of all clients that may wait."""
 KNOWN_BYTES = 256 * 2**20
-"""Most bytes of answers that are kept for clients that ask again because they never got them."""
+"""Maximum size in bytes of answers kept for clients that ask again because they never got them."""
 _log = logging.getLogger("shim.connections")
 _log.addHandler(logging.NullHandler())
 _log.propagate = False  # every stranger who connects would write a line
@@ -180,7 +180,7 @@ class Server:
         task.add_done_callback(lambda _: tasks.pop(name, None))
 
     def _full(self, tasks: dict[bytes, Any]) -> str:
-        """Return why no row of a client is taken now; empty where one is."""
+        """Return why no row of a client is taken now; empty if one is."""
         if len(tasks) >= IN_FLIGHT:
             return "too many rows unanswered"
         return "the queue is full" if len(self._jobs) >= QUEUE else ""
