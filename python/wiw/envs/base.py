@@ -20,29 +20,29 @@ class Segment:
     """The outcome of executing one decision's actions."""
 
     observation: Any
-    """The view at its end, such as a `wiw.types.Observation`."""
+    """The observation at its end, such as a `wiw.types.Observation`."""
     executed: NDArray[Any]
-    """The actions carried out: fewer than planned where the episode ended on the way."""
+    """The executed actions: fewer than planned if the episode ended on the way."""
     path: NDArray[np.float64]
     """float64 [len(executed) + 1, 3]: world positions from before the first action to after the last."""
     terminated: bool
     truncated: bool
     key: Key | None = None
-    """Key of the next decision, where the environment counts decisions itself."""
+    """Key of the next decision, if the environment counts decisions itself."""
     refused: tuple[str, ...] = ()
-    """Why actions were not carried out to their ends, one reason for each such action."""
+    """Why actions were not executed to their end, one reason for each such action."""
 
 
 class Guide(ABC):
     """Ground truth about plans from an environment's present state.
 
-    Only the loop passes guides on, to stages that an experiment gives the ground truth; policies and models get none.
+    Only the loop passes on guides, to stages that an experiment gives ground truth; policies and models get none.
     """
 
     @abstractmethod
     def evaluate_plan(self, plan: NDArray[Any]) -> float:
-        """Return how good a plan truly is, the higher the better: the progress at its end, or where it gets all the way
-        before that.
+        """Return the true value of a plan, higher is better: the progress at its end, or at the point where it
+        completes the task.
         """
 
     @abstractmethod
@@ -66,9 +66,9 @@ class Env(ABC):
 
     @abstractmethod
     def run(self, plan: Any, answer: Answer | TextAnswer | None = None) -> Segment:
-        """Carry out the actions of one decision, as far as the episode continues, and observe once, at the end.
+        """Execute the actions of one decision, as long as the episode continues, and observe once, at the end.
 
-        `answer` is what the agent believes now; the loop gives it only where the goal expects one.
+        `answer` is what the agent believes now; the loop passes it only if the goal expects one.
         """
 
     @property
@@ -83,14 +83,14 @@ class Env(ABC):
 
     @abstractmethod
     def truth(self) -> Truth:
-        """Return where the agent truly is; for records, metrics and reports alone."""
+        """Return where the agent truly is; only for records, metrics and reports."""
 
     @abstractmethod
     def result(self) -> Mapping[str, float]:
         """Return the metrics of the running episode, "success" (0 or 1) among them."""
 
     def details(self) -> Mapping[str, Any]:
-        """Return what is recorded of the running episode besides its metrics, JSON-able."""
+        """Return what is recorded of the running episode besides its metrics, as JSON-able values."""
         return {}
 
     def fork(self) -> Any:
@@ -119,7 +119,7 @@ class Env(ABC):
 
 
 def read_episode_option(options: Mapping[str, Any] | None) -> Any:
-    """Return the "episode" of gymnasium's reset options; None if it is left open.
+    """Return the "episode" of gymnasium's reset options; None if not given.
 
     Raises:
         ArgumentError: another option.

@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Scenes: meshes, Gazebo worlds and real scans from files.
+"""Scenes: generated apartments, and meshes, Gazebo worlds and real scans from files.
 
-World frame: metres, Y up, right-handed. See `Scene` for what a scene tells about itself.
+World frame: metres, Y up, right-handed. See `Scene` for a scene's attributes.
 """
 
 from __future__ import annotations
@@ -49,9 +49,9 @@ COLORS = (
 """Colour words of apartments. Weights count classes by their order."""
 
 MOST_MISSING = 0.05
-"""Share of a scan's surface whose texture may be missing."""
+"""Largest share of a scan's surface whose texture may be missing."""
 ALLOW_VARIABLE = "WIW_ALLOW_MISSING_TEXTURES"
-"""Environment variable that allows more, also in the processes that a run starts."""
+"""Environment variable that allows more, also for processes that a run starts."""
 
 _log = logging.getLogger("wiw.scenes")
 
@@ -67,22 +67,22 @@ def load(
     texture_folders: Sequence[str | PathLike[str]] = (),
     model_folders: Sequence[str | PathLike[str]] = (),
 ) -> Scene:
-    """Reads a GLB, glTF, OBJ, PLY or DAE mesh, a Gazebo `.world` or `.sdf` file, or a real scan.
+    """Read a GLB, glTF, OBJ, PLY or DAE mesh, a Gazebo `.world` or `.sdf` file, or a real scan.
 
-    A scan is opened by its mesh, and known by the files beside it (`docs/real-scans.md`).
+    A scan is opened by its mesh, and recognised by the files next to it (`docs/real-scans.md`).
 
     Args:
-        path: the file; `~` is understood.
+        path: the file; `~` is expanded.
         up: "y", "z" or None: by the file (COLLADA header; Y for glTF, OBJ and PLY; Z for scans and for names in HM3D's
             layout). The rule that was used is `scene.attributes["up"]`.
-        ceiling: closes a scene that is open above, in metres above its floor.
-        cache: keep the imported scene on disk (`$WIW_CACHE` or `~/.cache/wiw`) and map it the next time.
+        ceiling: height in metres above the floor at which to close a scene that is open above.
+        cache: cache the imported scene on disk (`$WIW_CACHE` or `~/.cache/wiw`), to be mapped the next time.
         isolate: import in a separate process, so that a file that crashes the reader raises FileError here.
         limits: raises or lowers the import limits: file_bytes, triangles, nodes, texture_pixels, texture_bytes.
-        texture_folders: searched for textures by base name, after the places beside the file.
-        model_folders: searched for `model://` of a world, before the places beside the file.
+        texture_folders: folders searched for textures by base name, after the places next to the file.
+        model_folders: folders searched for a world's `model://`, before the places next to the file.
 
-    What had to be left out, such as a texture that is missing, is logged and listed in `scene.warnings`.
+    Whatever had to be left out, such as a missing texture, is logged and listed in `scene.warnings`.
 
     Raises:
         FileError: naming file and cause: missing, damaged, unsupported or above the limits.
@@ -126,10 +126,10 @@ def _load(file: Path, options: dict[str, Any], cache: bool, isolate: bool) -> Sc
 def apartment(seed: int, split: str = "val", cache: bool = True, *, edits: Sequence[str] = ()) -> Scene:
     """Generate a furnished apartment, the same for the same seed and split; splits share neither layouts nor palettes.
 
-    With `cache` it is made once, in seconds, and then mapped from disk like imported scenes, until the compiled core
-    changes. An edit changes one thing and leaves all else as it is, with light baked for the edited apartment:
-    "color:sofa_1=blue", "state:floor_lamp_1=off", "remove:vase_1" or "swap:plant_1,floor_lamp_2". Names are those of
-    instances, with "_" or "+" for a space; where several doors or windows have one name, ".2" is the second.
+    With `cache` it is generated once, in seconds, and then mapped from disk like imported scenes, until the compiled
+    core changes. An edit changes one thing and leaves everything else unchanged, with light baked for the edited
+    apartment: "color:sofa_1=blue", "state:floor_lamp_1=off", "remove:vase_1" or "swap:plant_1,floor_lamp_2". Names are
+    those of instances, with "_" or "+" for a space; if several doors or windows share a name, ".2" is the second.
 
     Raises:
         ArgumentError: `split` is not "train", "val" or "test"; or an edit cannot be done, with what is possible.
@@ -147,10 +147,10 @@ def apartment(seed: int, split: str = "val", cache: bool = True, *, edits: Seque
 
 
 def apartment_table(seed: int, split: str = "val", *, edits: Sequence[str] = ()) -> Scene:
-    """Return rooms and instances of an apartment without its textures and light, in a small part of the time.
+    """Return rooms and instances of an apartment without its textures and light, in a fraction of the time.
 
-    `instances`, `rooms`, `attributes` and all triangles are those of `apartment`, so that it serves for questions and
-    for navigation meshes; pictures of it show plain colours.
+    `instances`, `rooms`, `attributes` and all triangles are those of `apartment`, so it is suitable for questions and
+    navigation meshes; renderings of it show plain colours.
     """
     return _core.scene.apartment_outline(seed, split, _core.scene.canonical_edits(list(edits)))
 
@@ -166,7 +166,7 @@ def possible_edits(spec: str) -> list[str]:
 
 
 SPLIT_SIZE = 1000
-"""Apartments that a spec without a number stands for."""
+"""Number of apartments in a spec without a number."""
 APARTMENTS = r"apartments:(train|val|test)(?:(?::([0-9]+))?:([1-9][0-9]*)|/([0-9]+))?"
 """Split, first, end, and number of a single one. A single one may be followed by "?" and edits, joined by "&"."""
 _FORMS = (
@@ -186,7 +186,7 @@ def strip_edits(spec: str) -> str:
 
 
 def absolute(spec: str | PathLike[str]) -> str:
-    """Return the spec with its path, if it is one, made absolute, so that it means the same in any folder."""
+    """Return the spec, made absolute if it is a path, so that it means the same in any folder."""
     spec = fspath(spec)
     scan = scans.parse_spec(spec)
     if scan is not None:
@@ -196,16 +196,16 @@ def absolute(spec: str | PathLike[str]) -> str:
 
 
 def resolve(spec: str | PathLike[str]) -> list[str]:
-    """Return the single scenes that a scene spec names, in order, none of them loaded.
+    """Return the single scenes that a scene spec names, in order, without loading them.
 
     "apartments:val" and "apartments:val:40" are the first 1000 or 40 apartments of a split, "apartments:val:40:60" are
     numbers 40 to 59, each named "apartments:val/7"; "hm3d:DIR:val" is each scan of a dataset's split, by its file (see
     `wiw.scenes.scans.KINDS`); anything else is the path of a mesh or a Gazebo world. The edits of
-    "apartments:val/7?state:floor_lamp_1=off&color:sofa_1=blue" come in one order and spelling, so that equal scenes
-    have equal names; whether the apartment can have them is found when it is opened.
+    "apartments:val/7?state:floor_lamp_1=off&color:sofa_1=blue" are put into canonical order and spelling, so that equal
+    scenes have equal names; whether the apartment allows them is checked when it is opened.
 
     Raises:
-        ArgumentError: the split or the count is not one, or an edit is not one.
+        ArgumentError: the split, the count or an edit is invalid.
         FileError: there is no such file, or no scan in the folder.
     """
     spec = fspath(spec)
@@ -232,7 +232,7 @@ def resolve(spec: str | PathLike[str]) -> list[str]:
 
 
 def _resembles_generated(spec: str) -> bool:
-    """Return whether a spec is no file and looks like a misspelt `apartments:`, to be refused as it was typed."""
+    """Return whether a spec is not a file and looks like a misspelt `apartments:`, to be refused as typed."""
     kind, colon, _ = spec.partition(":")
     return bool(colon and did_you_mean(kind, ["apartments"])) and not Path(spec).expanduser().exists()
 
@@ -255,7 +255,7 @@ def _parse_single(spec: str) -> tuple[int, str, list[str]]:
 
 
 def _did_you_mean(spec: str) -> str:
-    """Return a hint at a split, or at a file beside the one that is not there."""
+    """Return a hint at a split, or at a similar file next to the missing one."""
     path = Path(spec).expanduser()
     kind, colon, rest = spec.partition(":")
     if did_you_mean(kind, ["apartments"]):

@@ -1,9 +1,9 @@
 # SPDX-License-Identifier: Apache-2.0
 """Collect a navigation dataset: posed panoramas with depth and actions along traversals of scenes, for post-training.
 
-Follows Algorithm 1 and the appendix on post-training data of the World-in-World paper. A scene's segments are
-functions of (scene, seed, pass, options); each is kept as it is recorded, and a file gets its name once it is complete,
-so that a collection killed at any moment resumes and ends with the same bytes.
+Follows Algorithm 1 and the appendix on post-training data of the World-in-World paper. A scene's segments are functions
+of (scene, seed, pass, options); each is stored as soon as it is recorded, and a file gets its name once it is complete,
+so that a collection killed at any moment can be resumed and ends with the same bytes.
 """
 
 from __future__ import annotations
@@ -65,17 +65,17 @@ def collect_navigation(
     progress: Progress | None = None,
     **asked: Any,
 ) -> NavigationData:
-    """Record what an agent sees on traversals of scenes; resume where it was interrupted.
+    """Record what an agent sees on traversals of scenes; resume an interrupted collection.
 
     Args:
-        out: a new folder, or one that the same call began.
+        out: a new folder, or one that the same call started.
         scenes: scene specs of train splits: "apartments:train:80", or files of meshes and worlds.
         preset: "default", or "paper" (waypoints within 3 m count as visited).
         rules: fields of `wiw.training.navigation_rules.NavigationRules` to replace.
         workers: number of processes; the files do not depend on it.
-        place: where they are: on this machine, or tasks on a Ray cluster whose machines all see the folder.
-        skip_errors: whether scenes that cannot be opened are left out; otherwise they are an error, once all others
-            are recorded.
+        place: where they run: on this machine, or as tasks on a Ray cluster whose machines all see the folder.
+        skip_errors: whether to skip scenes that cannot be opened; otherwise they are an error, once all others are
+            recorded.
         progress: called whenever a pass over a scene is finished.
         **asked: passes, seed, perspective, size, height, depth, lossless, backend, as in
             `wiw.training.navigation_recording.NavigationCollection`.
@@ -83,7 +83,7 @@ def collect_navigation(
     Raises:
         BackendError: the requested renderer does not work here.
         DependencyError: pyarrow is not installed.
-        ArgumentError: an option is out of range, a scene is of a val or test split, or the folder holds another
+        ArgumentError: an option is out of range, a scene is of a val or test split, or the folder holds a different
             collection.
         FileError: a scene is missing, or the folder cannot be written.
         InfrastructureError: scenes cannot be opened, or a worker process has died.
