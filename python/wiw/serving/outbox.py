@@ -10,7 +10,7 @@ from collections.abc import Callable
 from typing import Any
 
 UNSENT_BYTES = 256 * 2**20
-"""Maximum size in bytes of a client's waiting messages; an answer beyond that is not queued, but must be requested again."""
+"""Maximum size in bytes of a client's waiting messages; one beyond that is not queued, and must be requested again."""
 
 
 class Outbox:
