@@ -153,7 +153,7 @@ class VlmError(InfrastructureError):
     """A vision-language model could not be queried after all retries.
 
     `kind` is "unreachable", "timeout", "status" (the server failed or was busy), "refused" (it never will), "protocol"
-    (a reply that is no completion) or "missing" (an answer that was not recorded).
+    (a reply that is not a completion) or "missing" (an answer that was not recorded).
     """
 
     def __init__(self, message: str = "", kind: str = "unreachable") -> None:

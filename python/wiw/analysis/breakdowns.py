@@ -47,7 +47,7 @@ class Breakdown:
     shown: frozenset[tuple[str, str]] = frozenset()
     """Row and column of the differences that the test, adjusted for all of the table, finds."""
     cut_unit: str = ""
-    """Unit of the cuts, "primitives" or "decisions"; empty if keys are no cuts."""
+    """Unit of the cuts, "primitives" or "decisions"; empty if keys are not cuts."""
 
     @property
     def keys(self) -> tuple[str, ...]:
@@ -101,7 +101,7 @@ class Breakdown:
 
 
 def split_by_kind(done: Done, metrics: Sequence[Metric], kind: str, seed: int) -> list[Breakdown]:
-    """Return a table per metric, by kind of episode; none where there is one kind.
+    """Return a table per metric, by kind of episode; none if there is one kind.
 
     Args:
         done: see `Done`.

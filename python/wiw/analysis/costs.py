@@ -58,7 +58,7 @@ class Costs:
         return sum(seconds for stage, seconds in self.seconds.items() if stage != "replay")
 
     def per_success(self, total: float) -> float:
-        """Return a total divided by the number of successes; inf where there is none."""
+        """Return a total divided by the number of successes; inf if there is none."""
         return total / self.successes if self.successes else math.inf
 
     def as_dict(self) -> dict[str, Any]:

@@ -344,7 +344,7 @@ def _describe_looks(info: Mapping[str, Any]) -> str:
 
 
 def _summarise_tiers(run: Run, outcomes: Sequence[Mapping[str, Any]], policies: Collection[str]) -> dict[str, Summary]:
-    """Return the numbers of each tier of episodes; nothing where there is one tier, or none."""
+    """Return the numbers of each tier of episodes; nothing if there is one tier, or none."""
     episodes = run.store.episodes()
     own = run.store.own_episodes() if "stopped" in run.store.info else range(len(episodes))
     tiers = dict.fromkeys(episodes[index].tier for index in own)

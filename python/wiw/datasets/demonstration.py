@@ -115,7 +115,7 @@ def decode_depths(pictures: Sequence[bytes]) -> NDArray[np.float32]:
 
 
 def decode_pictures(pictures: Sequence[bytes], how: int) -> NDArray[Any]:
-    """[T, H, W, ...]; what is damaged is no picture, or one of another size."""
+    """[T, H, W, ...]; what is damaged is not a picture, or one of another size."""
     try:
         images = [cv2.imdecode(np.frombuffer(data, np.uint8), how) if data else None for data in pictures]
         whole = [image for image in images if image is not None]

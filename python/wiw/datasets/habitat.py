@@ -47,7 +47,7 @@ def is_habitat(body: Any) -> bool:
 
 
 def _first(body: Any, name: str) -> Mapping[str, Any]:
-    """Return the first object of a list in a parsed file; an empty one where there is no such list."""
+    """Return the first object of a list in a parsed file; an empty one if there is no such list."""
     items = body.get(name) if isinstance(body, Mapping) else None
     return items[0] if isinstance(items, list) and items and isinstance(items[0], Mapping) else {}
 
@@ -139,7 +139,7 @@ def _world_in_world(item: Mapping[str, Any], where: str, folder: Path) -> Episod
 
 
 def _find_picture(folder: Path, relative: str) -> str | None:
-    """Return the whole path of a picture within a folder; None if it is not there."""
+    """Return the whole path of a picture within a folder; None if it does not exist."""
     path = (folder / relative).resolve()
     return str(path) if path.is_relative_to(folder.resolve()) and path.is_file() else None
 

@@ -109,7 +109,7 @@ class NavigationData(Sequence[NavigationSegment]):
 
 
 class Clips(Sequence[NavigationSegment]):
-    """Windows of one length, in order; each is read when it is asked for."""
+    """Windows of one length, in order; each is read when it is requested."""
 
     def __init__(self, data: NavigationData, length: int, stride: int = 1) -> None:
         if length < 1 or stride < 1:

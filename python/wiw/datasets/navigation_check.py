@@ -77,7 +77,7 @@ def verify_datasets(
 
     Raises:
         DependencyError: pyarrow is not installed.
-        FileError: a folder is no finished dataset.
+        FileError: a folder is not a finished dataset.
     """
     found, datasets = Verification(), [NavigationData(folder) for folder in folders]
     total = sum(len(_frame_files(data)) for data in datasets)

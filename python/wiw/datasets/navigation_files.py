@@ -1,5 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Files of the navigation dataset: Parquet, a row a frame, a row group a segment (`docs/collecting-navigation.md`)."""
+"""Files of the navigation dataset: Parquet, a row per frame, a row group a segment
+(`docs/collecting-navigation.md`).
+"""
 
 from __future__ import annotations
 
@@ -127,7 +129,7 @@ class FrameFile(RowGroupFile):
     """A file of frames that is read segment by segment.
 
     Raises:
-        FileError: it is not there, is damaged, or is none of ours.
+        FileError: it does not exist, is damaged, or is none of ours.
     """
 
     def __init__(self, path: Path) -> None:

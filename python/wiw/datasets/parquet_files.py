@@ -13,7 +13,7 @@ from wiw.errors import DependencyError, FileError
 from wiw.files import atomic_file
 
 MANIFEST = "manifest.json"
-"""Name of the file in a folder that says what was asked for."""
+"""Name of the file in a folder that says what was requested."""
 KEY = b"wiw"
 """Key of the Parquet metadata, which are JSON."""
 
@@ -104,7 +104,7 @@ class RowGroupFile:
         what: what is in it, for messages.
 
     Raises:
-        FileError: it is not there, is damaged, or is of another format.
+        FileError: it does not exist, is damaged, or is of another format.
     """
 
     def __init__(self, path: Path, form: int, what: str) -> None:

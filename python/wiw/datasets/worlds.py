@@ -34,7 +34,7 @@ class World:
     ground: Ground
     """Heights of the floor; the mesh lies up to 0.2 m above it."""
     backend: Literal["auto", "cpu", "gpu"] = "auto"
-    """As the renderer was asked for."""
+    """The renderer that was requested."""
 
     @cached_property
     def roofs(self) -> frozenset[int]:
@@ -43,7 +43,7 @@ class World:
 
     @cached_property
     def floor(self) -> int:
-        """The largest island of the navigation mesh that is no roof: where episodes take place."""
+        """The largest island of the navigation mesh that is not a roof: where episodes take place."""
         return next((index for index in range(len(self.navmesh.islands)) if index not in self.roofs), 0)
 
 

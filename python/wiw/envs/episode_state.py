@@ -212,7 +212,7 @@ def count_leading_turns(plan: Any) -> int:
 
 
 def draw_episode(task: NavigationSpec, random: np.random.Generator) -> int:
-    """Return a random episode's number; among the first 64 where there is no end of them."""
+    """Return a random episode's number; among the first 64 if there is no end of them."""
     return int(random.integers(task.episode_count or 64))
 
 
@@ -240,7 +240,7 @@ def start_episode(task: NavigationSpec, episode: Episode) -> tuple[Any, EpisodeS
 
 
 def image_names(task: NavigationSpec, depth: bool) -> list[str]:
-    """Return the images that the simulator is asked for, by its names."""
+    """Return the images to request from the simulator, by its names."""
     return ["panorama", "front", *(["depth"] if depth else []), *([] if task.pointing is None else IDS)]
 
 

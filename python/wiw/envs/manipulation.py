@@ -174,7 +174,7 @@ class ManipulationEnv(gymnasium.Env[dict[str, Any], NDArray[np.float64]], Env):
         return TableGuide(self.task, self.table, self.fork())
 
     def truth(self) -> Truth:
-        """Return where the gripper is, for records and reports alone; no distance leads to what is asked for."""
+        """Return where the gripper is, for records and reports alone; no distance leads to what is requested."""
         return Truth(self.table.bench.pose[:3], 0.0, float("nan"), float("nan"))
 
     def result(self) -> dict[str, float]:

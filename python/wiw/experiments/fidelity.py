@@ -52,7 +52,7 @@ class FidelityObserver(Observer, Privileged):
         oracle: which the plans are replayed in; one of the usual size where None.
 
     Raises:
-        WeightsError: those of LPIPS are not there.
+        WeightsError: those of LPIPS are missing.
         ArgumentError: a share out of range.
     """
 
@@ -138,7 +138,7 @@ def _copy_memory(situation: Situation) -> Situation:
 
 
 def _view_of(rollout: Rollout, ends: bool, source_size: tuple[int, int] | None) -> FrameSpec:
-    """Return the rollout's own view and size, of panoramas as large as those that its model was asked for."""
+    """Return the rollout's own view and size, of panoramas as large as those that its model was requested."""
     return FrameSpec(rollout.view, (rollout.frames.shape[-3], rollout.frames.shape[-2]), ends, source_size)
 
 

@@ -158,7 +158,7 @@ def make_schema() -> type[BaseModel]:
 
 
 def _refuse_booleans(value: Any) -> Any:
-    """Return a value that is no boolean; true equals 1 and would pass for it."""
+    """Return a value that is not a boolean; true equals 1 and would pass for it."""
     if isinstance(value, bool):
         raise ValueError("expected a number")
     return value

@@ -97,7 +97,7 @@ def is_negated(words: Sequence[str], match: Match) -> bool:
 
 
 def _narrow_down(clause: list[str]) -> list[list[str]]:
-    """Return the parts of a clause that may name what is asked for, most specific first; each keeps its negation."""
+    """Return the parts of a clause that may name what is requested, most specific first; each keeps its negation."""
     verbs = [place for place, word in enumerate(clause) if word in _COPULAS]
     rest = clause[verbs[-1] + 1 :] if verbs else clause
     if any(word in NEGATIONS for word in clause) and not any(word in NEGATIONS for word in rest):

@@ -14,7 +14,7 @@ from wiw.judging.words import split_clauses
 
 ANCHOR_MARK, ROOM_MARK, CATEGORY_MARK = 4, 3, 2
 BROADER_ROOM_MARK = 4
-"""Mark of "bedroom" where "kids room" is all that was asked for."""
+"""Mark of "bedroom" where "kids room" is all that was requested."""
 _SIDES = {
     "under": ("under", "below", "beneath", "underneath"),
     "above": ("above", "over"),
@@ -69,8 +69,8 @@ def names_place(question: str, text: str) -> bool:
 def mark_place(question: str, right: str, answer: str) -> int:
     """Return 5 for anchor and room, 4 for the anchor, 3 for the room, 2 for a wrong anchor of the right category.
 
-    What the question mentions and the right answer does not, such as the thing whose place is asked for, is no anchor.
-    Where the right answer has only an anchor or only a room, that alone is worth 5.
+    What the question mentions and the right answer does not, such as the thing whose place is requested, is not an
+    anchor. Where the right answer has only an anchor or only a room, that alone is worth 5.
     """
     wanted = read_place(right)
     known = {part.concept for part in (*wanted.anchors, *wanted.rooms)}

@@ -53,7 +53,7 @@ class Attempted(ModelWrapper):
 
     Args:
         model: what is asked.
-        deadline: seconds that a call may take; `math.inf` waits for ever. A model that is handed the simulator is asked
+        deadline: seconds that a call may take; `math.inf` waits for ever. A model that is given the simulator is asked
             in the caller's own thread, without a deadline: a graphics context belongs to the thread that made it.
     """
 

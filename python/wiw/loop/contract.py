@@ -135,7 +135,7 @@ def check_answers(policy: Policy, answers: Any, situations: Sequence[Situation])
     That is a distribution over the goal's choices, or a text where the goal is a question.
 
     Raises:
-        ContractError: another kind of answer, other choices, or numbers that are no probabilities.
+        ContractError: another kind of answer, other choices, or numbers that are not probabilities.
     """
     name = f"{type(policy.unwrapped).__name__}.answer"
     if not isinstance(answers, Sequence) or len(answers) != len(situations):
@@ -152,7 +152,7 @@ def check_pictures(policy: Policy, pictures: Any) -> dict[str, NDArray[np.uint8]
     """Return the pictures of a policy, uint8 [H, W, 3] by name.
 
     Raises:
-        ContractError: an array of another shape, or a name that is no identifier.
+        ContractError: an array of another shape, or a name that is not an identifier.
     """
     name = f"{type(policy.unwrapped).__name__}.draw"
     if not isinstance(pictures, Mapping):

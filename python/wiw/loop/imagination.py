@@ -68,10 +68,10 @@ class Imagination(ABC):
     view: View = "perspective"
     """That the model imagines."""
     source_size: tuple[int, int] | None = None
-    """(height, width) that a model of a range of sizes was asked for; None of a model of one size."""
+    """(height, width) requested from a model with a range of sizes; None for a model with only one size."""
     pose_errors: Sequence[NDArray[np.float64] | None] | None = None
-    """float64 [M, 2] by episode, metres and degrees: how far from their places each plan's frames were taken, in the
-    mean; NaN for a plan without imagined frames. None if nobody knows, as for most models."""
+    """float64 [M, 2] by episode, metres and degrees: how far from their places each plan's frames were taken, on
+    average; NaN for a plan without imagined frames. None if nobody knows, as for most models."""
 
     @abstractmethod
     def show(self, frames: FrameSpec) -> list[list[Rollout]]:

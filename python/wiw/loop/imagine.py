@@ -93,7 +93,7 @@ def imagine_primitives(model: WorldModel, request: Request) -> ImaginedPrimitive
 def _show(
     batch: Any, panoramas: Sequence[NDArray[np.uint8]], answers: list[NDArray[np.uint8]], kind: View, frames: FrameSpec
 ) -> list[list[Rollout]]:
-    """Rollouts in the views that are asked for, or in the front view where the model gives no other."""
+    """Rollouts in the views that are requested, or in the front view where the model gives no other."""
     view = "front" if kind == "perspective" else frames.view
     size = frames.size if view == frames.view else (384, 384)
     shown = batch.views(panoramas, answers, view_maker(view, size), kind)

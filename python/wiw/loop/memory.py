@@ -64,7 +64,7 @@ class EpisodeMemories:
     Args:
         policy: that proposes.
         reviser: that scores.
-        accepts: declaration of the world model, in the size that it is asked for; None without one.
+        accepts: declaration of the world model, in the size requested from it; None without one.
     """
 
     def __init__(self, policy: Policy, reviser: Policy, accepts: Accepts | None) -> None:

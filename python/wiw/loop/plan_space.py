@@ -35,7 +35,7 @@ class PlanSpace(ABC):
             longest: most actions.
 
         Raises:
-            ContractError: it is no plan of this space, or too long.
+            ContractError: it is not a plan of this space, or too long.
         """
 
     @abstractmethod

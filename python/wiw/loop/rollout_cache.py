@@ -204,7 +204,7 @@ class Cached(ModelWrapper):
 def cache_rollouts(model: WorldModel, cache: str | Path = "auto", budget_gb: float = BUDGET_GB) -> WorldModel:
     """Return the model behind a cache: with "auto" if it is `cacheable`, never with "off", else in a folder.
 
-    A model that is handed the simulator is never cached: its answer depends on a whole scene, which no key can hold.
+    A model that is given the simulator is never cached: its answer depends on a whole scene, which no key can hold.
     Nor is one without a `version`, for nobody could tell when its answers change: a warning names it.
     """
     accepts = model.accepts

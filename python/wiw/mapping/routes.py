@@ -298,7 +298,7 @@ def _is_in_sight(grid: OccupancyGrid, places: NDArray[np.float64], point: NDArra
 
 
 def _distance_field(open_: NDArray[np.bool_], goals: NDArray[np.bool_]) -> NDArray[np.float64]:
-    """Return the metres from each open cell to the nearest goal; inf where there is no way."""
+    """Return the metres from each open cell to the nearest goal; inf if there is no way."""
     rows, columns = np.flatnonzero(open_.any(axis=1)), np.flatnonzero(open_.any(axis=0))
     box = (slice(rows[0], rows[-1] + 1), slice(columns[0], columns[-1] + 1))
     inner = open_[box]

@@ -37,7 +37,7 @@ class RedNet(Semantics):
     Raises:
         DependencyError: torch is not installed.
         WeightsError: there is no such file ("missing"), or it is no such checkpoint ("unfit").
-        ArgumentError: a face that is no multiple of 32, no range of depths, or no such device.
+        ArgumentError: a face that is not a multiple of 32, no range of depths, or no such device.
     """
 
     needs = ("depth",)
@@ -87,7 +87,7 @@ class RedNet(Semantics):
         """Label perspective views: uint8 [B, H, W, 3] and planar depth float32 [B, H, W] to uint32 [B, H, W].
 
         Raises:
-            ArgumentError: arrays of other shapes, or sides that are no multiples of 32.
+            ArgumentError: arrays of other shapes, or sides that are not multiples of 32.
         """
         sides = images.shape[1:3]
         if images.ndim != 4 or depth.shape != images.shape[:3] or any(side % STRIDE for side in sides):

@@ -161,7 +161,7 @@ def sentence(summary: Summary, words: Wording | None = None) -> str:
 
 
 def explain_metrics(summary: Summary, words: Wording) -> list[tuple[str, str]]:
-    """Return what each column of the table of arms means in this task, and who gave the marks where there are any."""
+    """Return what each column of the table of arms means in this task, and who gave the marks if there are any."""
     own = {
         "success": f"Success rate: percent of episodes that {words.succeeded}.",
         "spl": f"Success weighted by path length. {SPL_RULE}",
@@ -270,7 +270,7 @@ def _draw_plots(
 
 
 def _plot_anytime_curves(summary: Summary) -> list[tuple[str, str, Markup]]:
-    """Return title, explanation and drawing of the anytime curve and of each paired difference, where there are any."""
+    """Return title, explanation and drawing of the anytime curve and of each paired difference, if there are any."""
     found = []
     for curve in summary.breakdowns:
         if curve.name == "anytime":

@@ -118,7 +118,7 @@ class Step:
     """The plan, where it is none of the candidates."""
     before: float | None
     after: float | None
-    """Metres of shortest way to the goal or target; straight-line where there is no way; None if the task has none.
+    """Metres of shortest way to the goal or target; straight-line if there is no way; None if the task has none.
     """
     note: str
     fidelity: str

@@ -42,7 +42,7 @@ def write_study(plan: Any, parts: Sequence[Any], numbers: str, folder: Path) -> 
         plan: the study (`wiw.studies.study_file.StudyPlan`).
         parts: what came of its runs.
         numbers: the same as JSON.
-        folder: that is there.
+        folder: that exists.
 
     Raises:
         FileError: it cannot be written.

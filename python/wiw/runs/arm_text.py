@@ -78,6 +78,6 @@ def split_arms(text: str) -> list[str]:
 
 
 def _is_place(model: str) -> bool:
-    """Return whether "=" belongs to an address, or to the path of a file that is there."""
+    """Return whether "=" belongs to an address, or to the path of a file that exists."""
     path, _, _ = model.rpartition(":")
     return "://" in model.partition("=")[0] or (path.endswith(".py") and Path(path).expanduser().is_file())

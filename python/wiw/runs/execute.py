@@ -117,7 +117,7 @@ def require_scenes(task: Any, store: RunStore, episodes: Iterable[Episode]) -> N
     """Check that the scenes of these episodes are the ones that the run began with.
 
     Raises:
-        FileError: a scene is not there.
+        FileError: a scene does not exist.
         StoreError: what belongs to a scene has come or gone.
     """
     kept = store.info.get("scenes", {})

@@ -20,7 +20,7 @@ JUDGE_ERROR = "judge/"
 NOT_JUDGED = "judge/missing"
 """Kind of an outcome that a judge has not been asked about."""
 _SHORT_NAMES = {"rules": "rules+approximate"}
-"""Names of judges as they are asked for, where they differ from what these call themselves."""
+"""Names of judges as they are requested, where they differ from what these call themselves."""
 OWN = "own"
 """Names the judge that the run was made with."""
 

@@ -156,7 +156,7 @@ class SilentBoard:
 
 
 class TerminalBoard:
-    """Rich bars; plain lines at quarter marks where the output is no terminal."""
+    """Rich bars; plain lines at quarter marks where the output is not a terminal."""
 
     def __init__(self) -> None:
         from rich.console import Console
@@ -230,7 +230,7 @@ class NotebookBoard:
         self._handle = display(HTML(""), display_id=True)
 
     def show(self, arm: str, progress: Progress) -> None:
-        """Redraw, at most five times a second."""
+        """Redraw, at most five times per second."""
         self._arms[arm] = progress
         if time.monotonic() - self._shown > 0.2:
             self._draw()

@@ -262,7 +262,7 @@ class _ActorPool:
         lease.unfinished = {index: own for index, own in lease.unfinished.items() if index not in episodes}
 
     def _withdraw_jobs(self) -> None:
-        """End all actors; what they have not finished is run by others, and this is no try of theirs."""
+        """End all actors; what they have not finished is run by others, and this is not a try of theirs."""
         for lease in self._leases:
             self._ray.kill(lease.actor)
             if lease.job is not None and lease.unfinished:

@@ -190,7 +190,7 @@ class ServerPool:
         server.ref = server.actor.start.remote(server.port if server.lost < TRIES - 1 else 0)
 
     def _make_actor(self, server: _Server) -> Any:
-        """Return an actor, on the node where the server was before if that is there."""
+        """Return an actor, on the node where the server was before if that exists."""
         from ray.util.scheduling_strategies import NodeAffinitySchedulingStrategy
 
         place: Any = "SPREAD" if server.node is None else NodeAffinitySchedulingStrategy(server.node, soft=True)

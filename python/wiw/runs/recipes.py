@@ -331,7 +331,7 @@ def find_control(model: Any) -> str:
 
 
 def _has_simulator(model: Any) -> bool:
-    """Return whether a world model, or one of that name, is handed the simulator; of the built-in ones oracle is."""
+    """Return whether a world model, or one of that name, is given the simulator; of the built-in ones oracle is."""
     found = WORLD_MODELS.find(model) if isinstance(model, str) else model
     return model == ERROR_MODEL or "simulator" in getattr(getattr(found, "accepts", None), "needs", ())
 
@@ -420,7 +420,7 @@ def agent_recipe(agent: Any) -> AgentRecipe | AgentInMemory:
     """Return a recipe of an agent.
 
     Raises:
-        ArgumentError: it is no agent.
+        ArgumentError: it is not an agent.
     """
     if isinstance(agent, AgentRecipe):
         return agent
@@ -440,7 +440,7 @@ def arm_recipes(agent: Any, arms: Any) -> dict[str, AgentRecipe | AgentInMemory]
 
     Raises:
         ArgumentError: an arm is named twice, or none is; a name that is empty, has forbidden characters or is a
-            reference's; options that are no KEY=VALUE; an agent of another method, which has no world model.
+            reference's; options that are not KEY=VALUE; an agent of another method, which has no world model.
     """
     recipe = agent_recipe(agent)
     if arms is None:

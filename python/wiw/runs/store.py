@@ -569,7 +569,7 @@ class RunStore:
             )
 
     def write_judged(self, row: JudgedRow) -> None:
-        """Write what a judge's marks make of an outcome; marks that are there already stay, an error is replaced."""
+        """Write what a judge's marks make of an outcome; marks that exist already stay, an error is replaced."""
         values = {name: getattr(row, name) for name in ("judge", "arm", "episode", "status", "error", "kind")}
         values |= {name: to_json(dict(getattr(row, name))) for name in OUTCOME_JSON}
         names = ", ".join(values)

@@ -85,7 +85,7 @@ def verify(run: str | Path, episodes: int = 3, seed: int = 0) -> Verification:
         ArgumentError: fewer than one episode.
         StoreError: the run cannot be read, is of another version of the benchmark, was started with objects in memory,
             has no finished episode, or its task or source files have changed.
-        FileError: a scene is not there.
+        FileError: a scene does not exist.
     """
     if episodes < 1:
         raise ArgumentError(f"verify: expected episodes of at least 1, got {episodes}")

@@ -42,7 +42,7 @@ class LaionScorer:
     Args:
         folder: holds the head's file, and CLIP in a folder of its own; "auto" is the folder of all weights,
             `~/.cache/wiw/weights`.
-        device: of torch; "auto" is the GPU where there is one.
+        device: of torch; "auto" is the GPU if there is one.
 
     Raises:
         WeightsError: weights are not there (says where they come from) or belong to another network.

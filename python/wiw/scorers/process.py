@@ -5,7 +5,7 @@ The command is started once, without a shell. Its first line on the standard out
 
     {"scorer": "my-musiq", "version": "1.0", "licence": "CC-BY-4.0", "scores": {"musiq": [0, 100]}}
 
-Then it reads paths of PNG files from the standard input, one a line, to the end, and answers each by a line, in any
+Then it reads paths of PNG files from the standard input, one per line, to the end, and answers each by a line, in any
 order:
 
     {"path": "/tmp/.../5f3a.png", "scores": {"musiq": 61.5}}

@@ -192,7 +192,7 @@ def parse_call(body: Mapping[str, Any]) -> Call:
     """Return the call that a request asks for.
 
     Raises:
-        ArgumentError: an image that is no data URI, or several completions at once.
+        ArgumentError: an image that is not a data URI, or several completions at once.
         KeyError: no messages.
     """
     if int(body.get("n") or 1) != 1 or body.get("stream"):

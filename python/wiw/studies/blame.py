@@ -69,7 +69,7 @@ def blame(
             answers questions with another policy than `explorer`; or overrides if nothing is left to rerun.
         StoreError: the run cannot be read, was started with objects in memory or by another version, or its task,
             agents or navigation meshes have changed.
-        FileError: a scene is not there.
+        FileError: a scene does not exist.
     """
     for name, value in (("episodes", episodes), ("workers", workers)):
         if value is not None and value < 1:
@@ -152,7 +152,7 @@ def _make_recipes(base: RunStore, wanted: Mapping[str, set[int]]) -> tuple[Any, 
     Raises:
         ArgumentError: the task does not say what progress is.
         StoreError: see `blame`.
-        FileError: a scene is not there.
+        FileError: a scene does not exist.
     """
     base.require_version()
     task, agents = read_recipes(base)

@@ -50,7 +50,7 @@ class AnswerRecord:
 
         Raises:
             KeyError: a metric is missing.
-            TypeError: one is no number, or an answer no text.
+            TypeError: one is not a number, or an answer no text.
         """
         for name in ("path_length", "shortest", "primitives"):
             if not isinstance(self.measured[name], int | float):

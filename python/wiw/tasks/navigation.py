@@ -139,7 +139,7 @@ class NavigationTask(NavigationSpec, Task):
 
     @property
     def episode_count(self) -> int | None:
-        """How many episodes there are; None if a single scene gives as many as are asked for."""
+        """How many episodes there are; None if a single scene gives as many as are requested."""
         if self.episode_file:
             return len(self._read_file())
         scenes = resolve(self.scenes)

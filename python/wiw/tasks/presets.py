@@ -31,7 +31,7 @@ from wiw.typed_values import read_values
 FOLDER = Path(__file__).parents[1] / "configs"
 DEFAULT, PAPER = "default", "paper"
 HEADER = ("base", "about", "policy", "generator", "policies", "models", "departures")
-"""Keys that are no rules."""
+"""Keys that are not rules."""
 CONCERNS = ("rules", "vlm", "models", "text models")
 """Whom a departure concerns: every run, runs with policy `vlm`, with a world model, with one that is told words."""
 
@@ -112,7 +112,7 @@ def load_rules(cls: type[Rules], task: str, preset: str | Path, overrides: Mappi
     the default preset stands for these values.
 
     Raises:
-        ArgumentError: no such preset; a key that is no rule; a value of another type. Names the file or argument.
+        ArgumentError: no such preset; a key that is not a rule; a value of another type. Names the file or argument.
         FileError: the file cannot be read, or does not hold a mapping.
     """
     values: dict[str, Any] = {}

@@ -52,7 +52,7 @@ class GoalPlaces:
     depths: NDArray[np.float16]
     """float16 [N, 128]: median metres seen in each column."""
     distances: NDArray[np.float16]
-    """float16 [N, N]: metres of the shortest path from place i to place j, inf where there is none."""
+    """float16 [N, N]: metres of the shortest path from place i to place j, inf if there is none."""
     bearings: NDArray[np.float16]
     """float16 [N, N]: azimuth at place i of the path to place j a metre on, in radians, left positive; 0 where none."""
     visible: NDArray[np.bool_]

@@ -93,7 +93,7 @@ class HeldOutClips(ABC, Generic[Errors]):
     plans: NDArray[Any]
     """[N, ...]: the actions, as `Imagine` takes them."""
     shuffled: NDArray[Any]
-    """[N, ...]: the actions of another clip; the same in another order where there is one clip alone."""
+    """[N, ...]: the actions of another clip; the same in another order if there is one clip alone."""
     steps: tuple[int, ...]
     """[S]: numbers of actions, ascending, at most those of a plan."""
 
@@ -115,7 +115,7 @@ class HeldOutClips(ABC, Generic[Errors]):
 
 
 def take_mean(values: NDArray[Any], chosen: NDArray[np.bool_]) -> float:
-    """Return the mean of the chosen values; NaN where there are none."""
+    """Return the mean of the chosen values; NaN if there are none."""
     return float(values[chosen].mean()) if chosen.any() else math.nan
 
 

@@ -91,8 +91,8 @@ def open_folder(folder: Path, config: Mapping[str, Any], read: Callable[[Path], 
 
     Args:
         folder: of the collection.
-        config: what is asked for; JSON-able.
-        read: reads the manifest of a folder; raises FileError where there is none.
+        config: what is requested; JSON-able.
+        read: reads the manifest of a folder; raises FileError if there is none.
 
     Raises:
         FileError: the folder cannot be written, or holds something else.

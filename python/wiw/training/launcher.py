@@ -138,7 +138,7 @@ def list_options(layout: ProcessLayout, host: str, name: str) -> list[str]:
 def run_processes(arguments: Sequence[str], layout: ProcessLayout) -> int:
     """Run a command of wiw on several processes of this machine, and return its exit code.
 
-    SIGTERM and Ctrl-C are handed on to all processes, and do once these have ended what they would have done.
+    SIGTERM and Ctrl-C are passed on to all processes, and do once these have ended what they would have done.
     """
     from torch.distributed import run
     from torch.distributed.elastic.multiprocessing import SignalException

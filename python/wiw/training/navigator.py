@@ -146,7 +146,7 @@ class Pairs:
     goals: Tensor
     """[P, 4, 32, 32]."""
     metres: Tensor
-    """[P * P]; inf where there is no way."""
+    """[P * P]; inf if there is no way."""
     bearings: Tensor
     """[P * P] azimuths from the panorama's front, in radians, left positive."""
     visible: Tensor

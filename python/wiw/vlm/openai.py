@@ -264,7 +264,7 @@ class _Retries:
 
 
 class _NoCompletionError(Exception):
-    """A reply that is no chat completion."""
+    """A reply that is not a chat completion."""
 
 
 class _BrokenOffError(Exception):

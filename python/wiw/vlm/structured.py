@@ -65,7 +65,7 @@ def parse_object(completion: Completion, schema: type[BaseModel]) -> tuple[Any, 
 
 
 def find_json_object(text: str) -> tuple[str, bool]:
-    """Return the first {...} in a text, and whether it is complete; braces in strings do not count. Empty where there
+    """Return the first {...} in a text, and whether it is complete; braces in strings do not count. Empty if there
     is none.
     """
     begin = text.find("{")

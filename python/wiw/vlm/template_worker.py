@@ -30,10 +30,10 @@ ENVIRONMENT = SandboxedEnvironment(undefined=StrictUndefined, trim_blocks=True, 
 
 
 def unknown_slot(source: str, slots: Mapping[str, Any]) -> str | None:
-    """Return the first variable of a template that is no slot, if there is one.
+    """Return the first variable of a template that is not a slot, if there is one.
 
     Raises:
-        TemplateSyntaxError: the source is no template.
+        TemplateSyntaxError: the source is not a template.
     """
     kinds = [kind for _, kind, _ in ENVIRONMENT.lex(source)]
     for name in ("raw", "comment"):  # Jinja takes one that is open at the end for an empty one

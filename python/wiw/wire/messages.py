@@ -132,7 +132,7 @@ def decode(data: Any) -> Message:
 
 
 def unpack_map(what: str, data: Any) -> dict[Any, Any]:
-    """Return a msgpack map whose parts are no larger than the bytes that came.
+    """Return a msgpack map whose parts are not larger than the bytes that came.
 
     Raises:
         RemoteError: anything else.

@@ -24,7 +24,7 @@ PLAN = ("actions", "trajectory", "viewpoints", "ids")
 
 @dataclass(frozen=True)
 class Row:
-    """One future that is asked for."""
+    """One future that is requested."""
 
     image: NDArray[np.uint8]
     depth: NDArray[np.float32] | None

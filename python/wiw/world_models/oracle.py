@@ -20,7 +20,7 @@ class Oracle(WorldModel):
     """Carry the plan out in a fork of the simulator and return what it truly sees there.
 
     No model imagines better, so its score is the reference for what imagination is worth to a policy. It is no strict
-    ceiling: a policy may succeed by chance where futures are wrong. It alone is handed the simulator.
+    ceiling: a policy may succeed by chance where futures are wrong. It alone is given the simulator.
 
     Args:
         size: height and width of its frames, whoever looks at them; where None, up to 576x1024 as the reviser needs,

@@ -39,7 +39,7 @@ def make_template(words: str | Mapping[str, Any] | None) -> TextTemplate | None:
     Phrases may hold {metres}, {degrees} and {count}.
 
     Raises:
-        ArgumentError: a key that is none, a value that is no text, or a prompt without {actions}.
+        ArgumentError: a key that is none, a value that is not a text, or a prompt without {actions}.
     """
     if words is None:
         return None

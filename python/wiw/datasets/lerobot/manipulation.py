@@ -59,7 +59,7 @@ def describe_features(manifest: Mapping[str, Any]) -> dict[str, Feature]:
 
 
 def estimate_rate(data: Demonstrations) -> int:
-    """Return the mean number of frames a second, rounded."""
+    """Return the mean number of frames per second, rounded."""
     times = [shard.read(index, ["seconds"]).column(0) for shard in data.files for index in range(len(shard))]
     seconds = sum(each[-1].as_py() for each in times)
     return max(1, round(sum(len(each) - 1 for each in times) / seconds)) if seconds else 1

@@ -47,7 +47,7 @@ def write_dataset(
         out: a new or empty folder.
         episodes: taken one by one.
         features: of their columns.
-        fps: frames a second, which timestamps are counted in.
+        fps: frames per second, which timestamps are counted in.
         robot: name of the kind of robot.
         source: JSON-able: what importing needs beyond the episodes.
         card: text of README.md.

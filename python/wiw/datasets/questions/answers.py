@@ -12,7 +12,7 @@ from wiw.datasets.questions.grammar import ACTIVITIES, CAPACITIES, HABITS, TEMPL
 Slots = Mapping[str, str]
 
 MATERIALS = {"wood planks": "wood", "wood parquet": "wood", "textile": "fabric", "enamel": "metal", "plant": ""}
-"""Words for materials that a table tells apart and nobody else does; "" is no answer."""
+"""Words for materials that a table tells apart and nobody else does; "" is not an answer."""
 ON_STATES, OPEN_STATES = ("on", "off"), ("open", "closed")
 COUNTED = (
     "chair",
@@ -50,7 +50,7 @@ LOOKED_FOR = (
     "wardrobe",
     "washing machine",
 )
-"""Categories whose existence is asked for."""
+"""Categories whose existence is requested."""
 PLURAL = frozenset({"books", "candles", "kitchen utensils"})
 """Categories whose names are plurals: nothing is asked about what "the books" are like."""
 PATTERNED = frozenset({"books", "mirror", "picture", "window"})

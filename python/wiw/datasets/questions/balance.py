@@ -5,7 +5,7 @@ Scenes are taken in blocks of four, in the order given, and a block's questions 
 scenes of the block, or in a scene and its twin, with different answers. So in every run each text occurs in two scenes
 at least, no answer of a text is right more than half of the time, and half of the yes-no questions are answered by yes.
 A block's episodes depend on its own scenes only, and pairs stay together: the first N episodes are the same however
-many are asked for, and every even N has the property.
+many are requested, and every even N has the property.
 """
 
 from __future__ import annotations

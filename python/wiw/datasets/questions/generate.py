@@ -208,7 +208,7 @@ def look_around(
     The rooms of a scene that does not tell them are found by what is in them (`mesh_table`); `attributes` says more.
 
     Raises:
-        ArgumentError: no rooms are found; attributes of instances that are not there.
+        ArgumentError: no rooms are found; attributes of instances that do not exist.
     """
     table = make_table(place.scene, place.name)
     if points is None:

@@ -1,6 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """The scene table of a scene that tells nothing but names: categories from these, colours from renders, rooms by
-`room_plan`, states and materials from nowhere, and all of it overridden by a file where there is one.
+`room_plan`, states and materials from nowhere, and all of it overridden by a file if there is one.
 """
 
 from __future__ import annotations

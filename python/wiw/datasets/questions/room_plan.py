@@ -69,7 +69,7 @@ class RoomPlan:
     origin: NDArray[np.float64]
     """float64 [2]: x and z where the first column and row begin."""
     labels: NDArray[np.int32]
-    """int32 [rows, columns]: number of the room, from 1 on; 0 where there is none, or nobody could say which."""
+    """int32 [rows, columns]: number of the room, from 1 on; 0 if there is none, or nobody could say which."""
     kinds: tuple[str, ...]
     """Kind of each room, by number - 1."""
 

@@ -45,7 +45,7 @@ class Degradation(ABC):
     draws_future: ClassVar[bool] = False
     """Whether something is drawn for a whole future, so that futures cannot share the frames of a common beginning."""
     needs_simulator: ClassVar[bool] = True
-    """Whether it acts on the fork of the simulator that only the oracle is handed."""
+    """Whether it acts on the fork of the simulator that only the oracle is given."""
 
     def __init__(self, dose: float) -> None:
         if not 0 <= dose <= self.most:

@@ -78,7 +78,7 @@ class ContentDegradation(Degradation):
 
 
 class Missing(ContentDegradation):
-    """Things that are not there."""
+    """Things that do not exist."""
 
     kind = "missing"
     about = "Leaves out random objects: furniture and small things, or what is on a table."

@@ -303,7 +303,7 @@ def read(file: Path, options: dict[str, Any]) -> Imported:
     """Read a scene.
 
     Raises:
-        FileError: it or its dataset is damaged, or files and templates that it names are not there; names all of them.
+        FileError: it or its dataset is damaged, or files and templates that it names do not exist; names all of them.
     """
     dataset, body = find_dataset(file), read_object(file)
     assembly = _Assembly(dataset, options)

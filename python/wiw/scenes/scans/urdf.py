@@ -33,7 +33,7 @@ def read_visuals(path: Path, pose: Mapping[str, float] | Sequence[float] = ()) -
         pose: joint values in radians and metres, by name or in the order of the movable joints; 0 for the others.
 
     Raises:
-        FileError: it is missing, no URDF, or its joints are no tree.
+        FileError: it is missing, no URDF, or its joints do not form a tree.
     """
     try:
         if path.stat().st_size > MOST_BYTES:

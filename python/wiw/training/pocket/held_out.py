@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Windows of held-out scenes, rendered as they are asked for: what world models are measured on.
+"""Windows of held-out scenes, rendered as they are requested: what world models are measured on.
 
 `wiw collect navigation` refuses scenes of val and test splits, so that nobody trains on them. These windows are drawn
 by the same traversals, and are never written.

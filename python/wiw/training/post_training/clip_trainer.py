@@ -160,7 +160,7 @@ class ClipTrainer(ResumableTrainer, ABC):
 
     @contextmanager
     def use_averages(self) -> Iterator[None]:
-        """Exchange the weights for their averages, where there are any, as long as the context lasts."""
+        """Exchange the weights for their averages, if there are any, as long as the context lasts."""
         self._exchange_averages()
         try:
             yield

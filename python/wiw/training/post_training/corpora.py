@@ -45,7 +45,7 @@ class Clip:
 
 
 class CorpusClips(Sequence[Clip], ABC):
-    """Clips of one length; each is read when it is asked for."""
+    """Clips of one length; each is read when it is requested."""
 
     @abstractmethod
     def describe(self, index: int) -> str:

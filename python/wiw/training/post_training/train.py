@@ -81,8 +81,8 @@ def post_train(
         weights: pretrained, a folder as the world model takes it or a name on the hub; its usual ones if None.
         revision: of the weights on the hub.
         variant: of the weight files, such as "fp16".
-        device: of torch; "cuda" where there is one, else "cpu".
-        recipe: the numbers; the shipped recipe if None, in float32 where there is no GPU.
+        device: of torch; "cuda" if there is one, else "cpu".
+        recipe: the numbers; the shipped recipe if None, in float32 if there is no GPU.
         part: of the data: "train", which leaves a share of scenes or demonstrations for validation, or "all".
         validation: folder of another dataset whose clips it is validated on; what is left out if None. With all of the
             data in training and no other dataset, there is no validation, and the checkpoint has the last weights.
@@ -294,7 +294,7 @@ def describe_training(loaded: Loaded, corpus: Corpus) -> dict[str, Any]:
 def write_checkpoint(
     out: Path, trainer: PostTrainer, card: Mapping[str, Any], replace: Callable[[Path], bool] = lambda _: False
 ) -> None:
-    """Write what world models load, and how it was made, as a folder that is there whole or not at all.
+    """Write what world models load, and how it was made, as a folder that exists whole or not at all.
 
     `replace` says whether a folder that holds something may be replaced.
 
@@ -319,7 +319,7 @@ def open_cache(folder: Path, loaded: Loaded, corpus: Corpus) -> LatentCache:
 
 
 def choose_precision(recipe: PostTrainingRecipe, device: str | None) -> PostTrainingRecipe:
-    """Return the recipe in float32 where there is no GPU, on which half precision is fast."""
+    """Return the recipe in float32 if there is no GPU, on which half precision is fast."""
     return recipe if devices.device(device).startswith("cuda") else replace(recipe, precision="float32")
 
 

@@ -40,9 +40,9 @@ class NWM(WorldModel):
         file: name of the checkpoint in the folder or repository.
         revision: branch, tag or commit of the repository.
         vae: folder or hub repository of the image codec (`AutoencoderKL`); by default the folder `vae` beside
-            the checkpoint, where there is one, else stabilityai/sd-vae-ft-ema.
+            the checkpoint, if there is one, else stabilityai/sd-vae-ft-ema.
         vae_revision: branch, tag or commit of that.
-        device: of torch; "cuda" where there is one, else "cpu".
+        device: of torch; "cuda" if there is one, else "cpu".
         precision: of the computation; bfloat16 on a GPU, float32 on the CPU. Weights stay float32.
         steps: of diffusion, for each frame.
         spacing: metres between waypoints of the training data that is likest to the agent's world: 0.25 recon, 0.38
@@ -145,7 +145,7 @@ class NWM(WorldModel):
             return self._roll_out(observations, motion, np.array([c.length for c in controls]), seeds)
 
     def _use_precision(self) -> Any:
-        """Compute products in the lower precision, where there is one."""
+        """Compute products in the lower precision, if there is one."""
         import torch
 
         dtype = getattr(torch, str(self.precision))

@@ -115,7 +115,7 @@ class Link:
             lost: seconds without a connection after which it waits no longer either.
 
         Raises:
-            RemoteError: not all are there in time ("connection" where there is none), or the server refuses one.
+            RemoteError: not all are there in time ("connection" if there is none), or the server refuses one.
             ContractError: the served model broke its contract.
         """
         if self._closed:

@@ -46,7 +46,7 @@ class VideoModel(WorldModel):
         weights: folder in the layout of `save_pretrained`, or name on the Hugging Face hub.
         revision: branch, tag or commit on the hub; pin a commit to run the same weights for ever.
         variant: of the weight files, such as "fp16".
-        device: of torch; "cuda" where there is one, else "cpu".
+        device: of torch; "cuda" if there is one, else "cpu".
         precision: of the weights; the model's usual half precision on a GPU, float32 on the CPU.
         offload: "model" keeps on the GPU only the network at work, "sequential" only the layer: less memory, slower.
         steps: denoising steps.

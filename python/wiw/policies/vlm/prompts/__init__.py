@@ -79,7 +79,7 @@ def list_tasks() -> list[str]:
 
 
 class Prompts:
-    """Templates of all tasks: a user's where there are any, else those shipped with the package.
+    """Templates of all tasks: a user's if there are any, else those shipped with the package.
 
     Args:
         source: name of a shipped set (`SETS`), or a folder with templates as `<task>/<name>.j2`, named like the shipped

@@ -58,7 +58,7 @@ def command_schema(marks: tuple[int, ...], count: int = 1, answers: bool = True)
 
     Args:
         marks: numbers of the landmarks that may be chosen.
-        count: how many commands are asked for.
+        count: how many commands are requested.
         answers: whether a command comes with an answer; not where imagined views are shown.
     """
     from pydantic import ConfigDict, Field, create_model, field_validator

@@ -37,7 +37,7 @@ def save(
     """Write a checkpoint.
 
     Args:
-        folder: where to; made if it is not there.
+        folder: where to; made if it does not exist.
         encoders: one for each denoiser, by its place in the pipeline ("unet", "transformer", "transformer_2").
         pipeline: holds the trained denoisers.
         lora: write their LoRA (peft's adapter "actions") instead of all their weights.

@@ -72,7 +72,7 @@ class ActionConfig:
         """Read `config.json`.
 
         Raises:
-            WeightsError: it is not there, damaged, or of another format.
+            WeightsError: it is missing, damaged, or of another format.
         """
         file = folder / FILE
         if not file.is_file():

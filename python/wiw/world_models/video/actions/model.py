@@ -115,7 +115,7 @@ class ActionConditioned(WorldModel):
         return load_denoisers(self._folder, self.denoisers, getattr(torch, str(generator.precision)))
 
     def _condition_denoisers(self) -> ActionConditioning:
-        """Put the LoRA, where there is one, and the encoders into the generator's pipeline."""
+        """Put the LoRA, if there is one, and the encoders into the generator's pipeline."""
         from wiw.world_models.video.actions.checkpoint import load_encoders, load_lora
         from wiw.world_models.video.actions.conditioning import ActionConditioning
         from wiw.world_models.video.actions.injection import embedding_width
