@@ -1,6 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Files of the navigation dataset: Parquet, a row per frame, a row group a segment
-(`docs/collecting-navigation.md`).
+"""Parquet files of the navigation dataset: one row per frame, one row group per segment.
+
+`docs/collecting-navigation.md` describes the columns.
 """
 
 from __future__ import annotations

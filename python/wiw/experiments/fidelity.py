@@ -138,7 +138,7 @@ def _copy_memory(situation: Situation) -> Situation:
 
 
 def _view_of(rollout: Rollout, ends: bool, source_size: tuple[int, int] | None) -> FrameSpec:
-    """Return the rollout's own view and size, of panoramas as large as those that its model was requested."""
+    """Return the rollout's own view and size, of panoramas as large as those requested from its model."""
     return FrameSpec(rollout.view, (rollout.frames.shape[-3], rollout.frames.shape[-2]), ends, source_size)
 
 

@@ -78,7 +78,7 @@ class ContentDegradation(Degradation):
 
 
 class Missing(ContentDegradation):
-    """Things that do not exist."""
+    """Some objects are missing."""
 
     kind = "missing"
     about = "Leaves out random objects: furniture and small things, or what is on a table."
@@ -126,7 +126,7 @@ class Moved(ContentDegradation):
 
 
 class Invented(ContentDegradation):
-    """Things that do not exist."""
+    """Objects appear that do not exist."""
 
     kind = "invented"
     about = "Shows copies of the scene's objects where there are none, on free floor within 4 m or on the table."
