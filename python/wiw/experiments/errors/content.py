@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Errors of content: the right place and looks, but things are missing, elsewhere, invented, or walls are open.
+"""Errors of content: the right place and looks, but objects are missing, moved or invented, or walls are open.
 
-They act on what is drawn, never on what happens: the simulator's own forks, physics included, stay true. Light that is
-baked into textures stays as it is.
+They affect only what is rendered, never what happens: the simulator's own forks, physics included, stay true. Light
+that is baked into textures is unchanged.
 """
 
 from __future__ import annotations
@@ -28,16 +28,16 @@ from wiw.types import GRIPPER_POSES, Conditioning, Control
 from wiw.world_models.base import WorldModel
 
 BARRIERS = frozenset({"wall", "door", "door frame", "window"})
-"""Categories that a hallucination of free space leaves out."""
+"""Categories left out by hallucinated free space."""
 AROUND = 4.0
-"""Metres from the agent within which things are invented."""
+"""Distance from the agent in metres within which objects are invented."""
 TABLE_AREA = ((-0.1, 0.4), (-0.4, 0.4))
 """Metres in x and y between which things are invented on a table."""
 
 
 @dataclass(frozen=True)
 class DrawnFork:
-    """Stands in for a fork of the simulator: its world is drawn otherwise, and cameras may go elsewhere."""
+    """Stands in for a fork of the simulator whose world is rendered differently, and whose cameras may be elsewhere."""
 
     renderer: Any
     find_cameras: Any
@@ -49,7 +49,7 @@ class DrawnFork:
 
 
 class ContentDegradation(Degradation):
-    """An error of what is there."""
+    """An error in what exists."""
 
     family = "content"
     draws_future = True
@@ -61,7 +61,7 @@ class ContentDegradation(Degradation):
         controls: Sequence[Control],
         seeds: NDArray[np.uint64],
     ) -> NDArray[np.uint8]:
-        """Return what the oracle sees of a world that is drawn with this error."""
+        """Return what the oracle sees of a world that is rendered with this error."""
         assert observations.simulators is not None
         draw = self.draw_table if model.accepts.space == GRIPPER_POSES else self.draw_world
         pairs = zip(observations.simulators, seeds, strict=True)
@@ -100,7 +100,7 @@ class Missing(ContentDegradation):
 
 
 class Moved(ContentDegradation):
-    """Things that are elsewhere."""
+    """Objects are in the wrong place."""
 
     kind = "moved"
     about = "Moves every object horizontally, each in its own direction, through whatever is there."
@@ -176,7 +176,7 @@ class OpenSpace(ContentDegradation):
         return DrawnFork(hidden.renderer, lambda actions: self._find_cameras(fork, actions, seed))
 
     def draw_table(self, bench: Any, seed: int) -> DrawnBench:
-        """Refuse: there are no walls around a table."""
+        """Raise an error: there are no walls around a table."""
         raise ArgumentError("error 'open': a table has no walls; expected plans of primitives")
 
     def misplace(self, simulator: Any, actions: NDArray[Any], seed: int) -> NDArray[np.float64]:

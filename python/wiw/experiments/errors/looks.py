@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Errors of looks: every frame shows the right place, but not as it looks. They go with any world model."""
+"""Errors of looks: every frame shows the right place, but looks wrong. They work with any world model."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ Image = NDArray[np.uint8]
 
 
 class FrameDegradation(Degradation):
-    """An error of single frames."""
+    """An error in single frames."""
 
     needs_simulator = False
 
@@ -36,7 +36,7 @@ class FrameDegradation(Degradation):
         controls: Sequence[Control],
         seeds: NDArray[np.uint64],
     ) -> NDArray[np.uint8]:
-        """Return the model's frames, each of them changed but for frame 0."""
+        """Return the model's frames, each changed except frame 0."""
         frames = np.array(model.rollout(observations, controls, seeds))
         panorama = model.accepts.view == "panorama"
         for row, control, seed in zip(frames, controls, seeds, strict=True):
@@ -125,7 +125,7 @@ class Tint(FrameDegradation):
 
 
 class Flicker(FrameDegradation):
-    """Frames that do not go together, as if each were generated with a seed of its own."""
+    """Frames that are inconsistent, as if each were generated with its own seed."""
 
     kind = "flicker"
     family = "flicker"
