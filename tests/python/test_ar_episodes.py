@@ -214,7 +214,7 @@ def a_file(path: Path, scene: str, **info: Any) -> Path:
         ({"target": None}, r"episode 0: info\.target: expected the id of an instance .* got None"),
         ({"target": 0}, r"info\.target"),
         ({"category": ""}, r"episode 0: info\.category: expected the target's category, got ''"),
-        ({"category": "sofa"}, r"episode 0: info\.category 'sofa' is none of the categories chest, .*categories=\["),
+        ({"category": "sofa"}, r"episode 0: info\.category 'sofa' is not among the categories chest, .*categories=\["),
     ],
 )
 def test_bad_fields_are_named(tmp_path: Path, two_rooms: str, info: dict[str, Any], message: str) -> None:

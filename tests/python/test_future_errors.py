@@ -306,7 +306,7 @@ def test_an_error_must_make_sense_for_task_and_model(two_rooms: str) -> None:
     table, room = Manipulation(), ImageNav(scenes=two_rooms)
     for arm, task, text in (
         ("error-open@1", table, "not defined for plans of space 'pose7'"),
-        ("error-lag@1:warp", room, "only the oracle is handed"),
+        ("error-lag@1:warp", room, "only the oracle is given"),
     ):
         (recipe,) = arm_recipes(AgentRecipe(task.default_policy), [arm]).values()
         with pytest.raises(ArgumentError, match=text):

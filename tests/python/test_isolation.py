@@ -200,7 +200,7 @@ def test_construction_and_import_fail_by_kind(tmp_path) -> None:
     made = make_model(name, steps=4)
     assert made.describe() == {"name": "Made", "steps": 4}
     assert pickle.loads(pickle.dumps(made)).describe() == made.describe()
-    with pytest.raises(ArgumentError, match="only the oracle is handed"):
+    with pytest.raises(ArgumentError, match="only the oracle is given"):
         make_model(write(head.replace("frames=3", "needs=('simulator',)")))
 
 

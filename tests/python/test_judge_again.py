@@ -300,7 +300,7 @@ def test_the_command(run: Path, capsys: pytest.CaptureFixture[str], tmp_path: Pa
         assert (
             "judge   rules+llm (m), " in shown.out
             and "no marks: warp 2: JudgeError" in shown.err
-            and "same command" in shown.err
+            and "repeat the command" in shown.err
         )
         assert "/7 answers" in shown.err, "progress is shown, also where there is no terminal"
         client.script = reply

@@ -271,7 +271,7 @@ def test_weights_are_stored_and_checked(tmp_path: Path, small: LearnedLabeller) 
     assert once.describe()["digest"] == again.describe()["digest"]
     assert once.describe()["digest"] != LearnedLabeller.of(small_network(1), CARD).describe()["digest"]
     file.write_bytes(file.read_bytes()[:-10])
-    with pytest.raises(WeightsError, match="expected weights of perception, whole"):
+    with pytest.raises(WeightsError, match="expected complete weights of perception"):
         LearnedLabeller(file)
     with pytest.raises(WeightsError, match="wiw train perception"):
         LearnedLabeller(tmp_path / "nothing")

@@ -326,7 +326,7 @@ def test_the_command_line(navigation: Path, tmp_path: Path, capsys: pytest.Captu
     printed = capsys.readouterr()
     assert f"written   {out}" in printed.out and "episodes: " in printed.err
     assert main(["data", "export", str(navigation), "--out", out]) == 2
-    assert "holds something already" in capsys.readouterr().err
+    assert "is not empty" in capsys.readouterr().err
     assert main(["data", "import", out, "--out", back]) == 0
     assert main(["data", "verify", back]) == 0
     assert capsys.readouterr().out.endswith("sound\n")
@@ -437,7 +437,7 @@ def test_what_cannot_be_exported_is_told(navigation: Path, manipulation: Path, t
         export_lerobot(begun, tmp_path / "out")
     (tmp_path / "full").mkdir()
     (tmp_path / "full" / "mine").write_text("kept")
-    with pytest.raises(FileError, match="holds something already"):
+    with pytest.raises(FileError, match="is not empty"):
         export_lerobot(manipulation, tmp_path / "full")
     assert contents(tmp_path / "full") == {"mine": b"kept"} and not (tmp_path / "out").exists()
 

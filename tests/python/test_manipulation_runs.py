@@ -134,7 +134,7 @@ def test_a_run_that_was_stopped_goes_on(run: Path, tmp_path: Path, monkeypatch: 
         (["--tasks", "slide_block,slide_block"], "different ones"),
         (["--preset", "official"], "choose from default, paper"),
         (["--task-option", "actions=0"], "must be positive"),
-        (["--task-option", "decisions=3"], "unknown rule 'decisions'; there are actions"),
+        (["--task-option", "decisions=3"], "unknown rule 'decisions'; expected one of actions"),
     ],
 )
 def test_what_does_not_apply_is_refused(flags: list[str], said: str, tmp_path: Path, capsys: Any) -> None:

@@ -128,6 +128,6 @@ def test_two_checkpoints_of_one_model_are_two_arms_of_a_run(shade, two_rooms, tm
     assert main(["resume", "run", "--no-report"]) == 0
     capsys.readouterr()
     assert main([*task, "--arms", "a=warp,a=copy", "--out", "wrong"]) == 2
-    assert "names of their own" in capsys.readouterr().err and not (tmp_path / "wrong").exists()
+    assert "name them:" in capsys.readouterr().err and not (tmp_path / "wrong").exists()
     with pytest.raises(RegistryError, match="unexpected keyword"):
         wiw.evaluate("imagenav", AgentRecipe("heuristic"), 1, scenes=two_rooms, arms=["a=copy?speed=3"], out="wrong")

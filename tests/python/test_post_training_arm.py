@@ -166,7 +166,7 @@ def test_corpora_that_do_not_fit_are_refused(demos: Path, weights: Any, tmp_path
     mirrored = tiny_recipe("svd-action", mirror=0.5)
     with pytest.raises(ArgumentError, match="the mirror image of a robot arm is a different arm"):
         post_train("svd-action", demos, tmp_path / "out", recipe=mirrored, **options)
-    with pytest.raises(FileError, match=r"meta.json is missing"):
+    with pytest.raises(FileError, match=r"meta.json does not exist"):
         post_train("svd-action", tmp_path, tmp_path / "out", recipe=tiny_recipe("svd-action"), **options)
 
 
@@ -273,7 +273,7 @@ def test_validation_on_what_is_trained_on_or_of_another_kind_is_refused(
 ) -> None:
     with pytest.raises(ArgumentError, match="expected demonstrations that are not trained on, got push_buttons"):
         train(tmp_path / "same", part="all", validation=demos)
-    with pytest.raises(ArgumentError, match=r"`wiw collect manipulation`, .* is of `wiw collect navigation`"):
+    with pytest.raises(ArgumentError, match=r"`wiw collect manipulation`, .* is from `wiw collect navigation`"):
         train(tmp_path / "moves", validation=save_dataset(tmp_path / "data"))
     with pytest.raises(ArgumentError, match="decisions: those of `wiw collect decisions` are for a moving agent"):
         train(tmp_path / "decisions", decisions=tmp_path / "d.parquet")

@@ -211,7 +211,7 @@ BAD = {
         "print('loading weights', flush=True)",
         "'loading weights'; print anything else to standard error",
     ),
-    "unknown": ("print(json.dumps({'path': 'x', 'scores': {}}), flush=True)", "'x', which it was not asked about"),
+    "unknown": ("print(json.dumps({'path': 'x', 'scores': {}}), flush=True)", "'x', which was not requested"),
     "repeated": (f"[{GOOD} for _ in range(2)]", "scored .* twice"),
     "names": (
         "print(json.dumps({'path': p, 'scores': {'musiq': 1}}), flush=True)",

@@ -111,7 +111,7 @@ def test_the_budget_is_kept(service, made):
 def test_a_broken_download_costs_no_second_order(service, made):
     service.broken_videos = 1
     model = made()
-    with pytest.raises(InfrastructureError, match="no video"):
+    with pytest.raises(InfrastructureError, match="not a video"):
         rollout(model)
     rollout(model)
     assert len(service.orders) == 1

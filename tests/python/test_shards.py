@@ -123,7 +123,7 @@ def test_the_command_line_runs_merges_and_compares(tmp_path, capsys):
     assert all("shard   " in each.err and "merge all shards with `wiw merge`" in each.out for each in shown)
     assert not list((tmp_path / "parts").rglob("report.html"))
     assert main(["merge", str(tmp_path / "parts"), "--out", str(tmp_path / "merged")]) == 0
-    assert "5 episodes of 2 stores" in capsys.readouterr().out
+    assert "5 episodes from 2 stores" in capsys.readouterr().out
     assert main(["report", str(tmp_path / "merged")]) == 0 and (tmp_path / "merged/report.html").exists()
     assert main(["verify", str(tmp_path / "merged")]) == 0
     assert main(["compare", str(tmp_path / "whole"), str(tmp_path / "merged")]) == 0

@@ -123,7 +123,7 @@ def test_nothing_probes_tasks_or_environments() -> None:
 def test_a_class_that_is_no_task_is_refused(tmp_path: Path) -> None:
     (tmp_path / "mine.py").write_text("class Mine:\n    name = 'mine'\n\n\ndef make():\n    return Mine()\n")
     for name in ("Mine", "make"):
-        with pytest.raises(RegistryError, match=r"is no task: expected a class derived from wiw\.Task"):
+        with pytest.raises(RegistryError, match=r"is not a task: expected a class derived from wiw\.Task"):
             TASKS.make(f"{tmp_path / 'mine.py'}:{name}")
     with pytest.raises(ArgumentError, match="expected a task"):
         task_recipe(object())

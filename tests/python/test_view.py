@@ -111,7 +111,7 @@ def test_a_view_is_replaced_and_nothing_else_is(log, tmp_path, capsys):
     assert main(["view", str(log.path), "--out", str(tmp_path / "v")]) == 0
     assert "9 episodes" in capsys.readouterr().out and [p.name for p in tmp_path.iterdir()] == ["v"]
     (tmp_path / "v" / "thesis.tex").write_text("mine")
-    with pytest.raises(FileError, match="holds something already"):
+    with pytest.raises(FileError, match="is not empty"):
         log.view(tmp_path / "v")
     assert (tmp_path / "v" / "thesis.tex").exists()
 

@@ -181,11 +181,11 @@ def _find_house_file(file: Path) -> Path:
 
 
 def _find_semantic_file(file: Path) -> Path:
-    return file.with_name(f"{file.stem}_find_semantic_file.ply")
+    return file.with_name(f"{file.stem}_semantic.ply")
 
 
 def read(file: Path, options: dict[str, Any]) -> Imported:
-    """Read a scan; without its `_find_semantic_file.ply` it has no instances of objects, and a warning."""
+    """Read a scan; without its `_semantic.ply` it has no instances of objects, and a warning."""
     up = options.get("up") or "z"
     scene, read, absent = import_scan(file, **import_options(options, up))
     house_file = require_file(_find_house_file(file), "expected Matterport3D's table of objects beside the mesh")

@@ -94,7 +94,7 @@ def find_held_out(
     held_out = open_part(corpus.data.folder, "held-out") if validation is None else open_part(validation, "all")
     if held_out.space != corpus.space:
         raise ArgumentError(
-            f"validation: expected a dataset of `{corpus.command}`like the training's, but {held_out.data.folder} is "
+            f"validation: expected a dataset of `{corpus.command}`, like the training's, but {held_out.data.folder} is "
             f"from `{held_out.command}`"
         )
     if decisions is not None and corpus.space != PRIMITIVES:
