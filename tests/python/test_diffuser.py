@@ -537,7 +537,7 @@ def test_the_command_trains_on_what_was_collected(tmp_path: Path, capsys: pytest
     few = ["--tasks", "slide_block", "--episodes", "2", "--frames", "16", "--depth", "--wrist"]
     assert main(["collect", "manipulation", *few, "--out", demos]) == 0
     assert main(["train", "diffuser", "--demonstrations", demos, "--epochs", "2", "--out", str(out)]) == 0
-    assert "2 demonstrations" in capsys.readouterr().out
+    assert "2 epochs" in capsys.readouterr().out
     assert [each.name for each in tmp_path.iterdir() if each.name.startswith("weights")] == [out.name]
     assert load(out)[1]["recipe"]["epochs"] == 2
     run = ["run", "manipulation", "--policy", "diffuser", "--policy-option", f"weights={out}", "--tasks", "slide_block"]

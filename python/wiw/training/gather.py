@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import json
 import zipfile
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import asdict, dataclass
 from functools import partial
 from hashlib import blake2b
@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 
 from wiw import scenes
 from wiw.datasets.worlds import world
-from wiw.errors import FileError
+from wiw.errors import ArgumentError, FileError
 from wiw.files import atomic_file
 from wiw.perception.glimpses import Glimpses
 from wiw.perception.scene_labels import CATEGORIES
@@ -38,12 +38,25 @@ from wiw.training.goal_places import GoalPlaces, PlaceRules, record_goal_places,
 from wiw.training.jobs import run_jobs
 from wiw.training.labelled_views import FIELDS as VIEW_FIELDS
 from wiw.training.labelled_views import LabelledViews, ViewRules, change_states, merge_views, record_views
+from wiw.training.preparation import ProgressBar
 from wiw.training.walks import WalkRules, Walks, record_walks
 from wiw.training.walks import merge_walks as merged_walks
 
 Arrays = Mapping[str, NDArray[Any]]
-ProgressBar = Callable[[Iterable[str], str, int], Iterable[str]]
-"""Wraps an iterable of a given number of items in a progress bar: (items, text, total)."""
+
+
+def require_held_out(specs: str, val: str) -> None:
+    """Check that no scene is both trained and evaluated on, whatever its path or the edits of an apartment.
+
+    Raises:
+        ArgumentError: names a scene that is in both.
+    """
+    trained = {scenes.strip_edits(scenes.absolute(name)) for name in scenes.resolve(specs)}
+    shared = next((name for name in scenes.resolve(val) if scenes.strip_edits(scenes.absolute(name)) in trained), None)
+    if shared is not None:
+        raise ArgumentError(
+            f"--val: expected held-out scenes that are not among --scenes, got {shared} in both; choose others"
+        )
 
 
 @dataclass(frozen=True)

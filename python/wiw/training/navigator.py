@@ -4,7 +4,8 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
+from pathlib import Path
 from typing import Any
 
 import cv2
@@ -17,13 +18,16 @@ from torch.nn import functional
 
 from wiw._core import core
 from wiw.errors import ArgumentError
-from wiw.networks import has_bfloat16
+from wiw.networks import has_bfloat16, single_thread
 from wiw.policies.matcher import appearance
 from wiw.policies.navigator.bands import BAND_ROWS, GOAL_COLUMNS, GOAL_WIDTH, WIDTH, get_goal_mask
 from wiw.policies.navigator.estimator import GoalEstimator, PlaceEstimates
 from wiw.policies.navigator.network import DISTANCES, HEADINGS, Estimate, Network, to_input
+from wiw.policies.navigator.weights import load, save
 from wiw.training.checkpoint import Checkpoint, ResumableTrainer
-from wiw.training.goal_places import GoalPlaces
+from wiw.training.gather import gather_goal_places, require_held_out
+from wiw.training.goal_places import GoalPlaces, PlaceRules
+from wiw.training.preparation import PREPARATION, Preparation, ProgressBar, show_no_bar
 from wiw.training.trainer import apply_gradients, run_training, warmup_cosine_schedule
 
 NEAR, FAR = 2.0, 9.0
@@ -71,6 +75,51 @@ class Recipe:
             raise ArgumentError(
                 f"Recipe: epochs, scenes, places, cluster, width and heads must be positive, got {self}"
             )
+
+
+def make_weights(
+    out: Path,
+    scenes: str,
+    val: str,
+    rules: PlaceRules = PlaceRules(),
+    recipe: Recipe = Recipe(),
+    minutes: float | None = None,
+    preparation: Preparation = PREPARATION,
+    on_step: Callable[[int, int, float], None] = lambda step, steps, loss: None,
+    bar: ProgressBar = show_no_bar,
+) -> dict[str, Any]:
+    """Record places, train on them, or resume, evaluate on held-out scenes, and write the weights; return the card.
+
+    Args:
+        out: file of the weights; the state of training is kept beside it.
+        scenes: training scenes, as in `wiw run --scenes`.
+        val: held-out scenes.
+        rules: which places are recorded.
+        recipe: how to train; its seed is that of the places, too.
+        minutes: if given, reduces the number of epochs so that training takes about this long.
+        preparation: how places are recorded and cached.
+        on_step: called after each step with its number, the number of all steps and a running mean of the loss.
+        bar: shows the progress of recording.
+
+    Raises:
+        ArgumentError: scenes that are both trained and evaluated on, or where nobody can walk from place to place; a
+            state of another training.
+        FileError: a file cannot be written.
+    """
+    require_held_out(scenes, val)
+    places = gather_goal_places(scenes, recipe.seed, rules, **preparation.list_arguments(bar))
+    held_out = gather_goal_places(val, recipe.seed, rules, **preparation.list_arguments(bar))
+    card: dict[str, Any] = {"scenes": scenes, "val": val, "places": sum(map(len, places))}
+    card |= {"sampling": asdict(rules)}
+    checkpoint = Checkpoint.beside(out, {**card, "recipe": asdict(recipe), "minutes": minutes})
+    with single_thread():
+        network, recipe = train(places, recipe, minutes, on_step, checkpoint)
+        card |= {"recipe": asdict(recipe), **measure_prior(places, recipe)}
+        save(out, network, card)  # before the evaluation, which takes another minute
+        card["held_out"] = evaluate(load(out)[0], card, held_out, recipe.seed)  # as stored, in half precision
+    save(out, network, card)
+    checkpoint.remove()
+    return card
 
 
 def train(

@@ -4,7 +4,8 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import asdict, dataclass, replace
+from pathlib import Path
 from typing import Any, ClassVar
 
 import cv2
@@ -16,7 +17,8 @@ from torch.nn import functional
 
 from wiw._core import core
 from wiw.errors import ArgumentError
-from wiw.networks import has_bfloat16
+from wiw.networks import has_bfloat16, single_thread
+from wiw.perception.labeller_weights import load, save
 from wiw.perception.labelling_network import (
     FINE_CELLS,
     MULTIPLE,
@@ -32,8 +34,11 @@ from wiw.perception.labelling_network import (
 )
 from wiw.perception.learned_labeller import LearnedLabeller
 from wiw.perception.scene_labels import CATEGORIES, STATES
+from wiw.training import color_naming
 from wiw.training.checkpoint import Checkpoint, ResumableTrainer
-from wiw.training.labelled_views import LabelledViews, compute_view_tangents
+from wiw.training.gather import gather_views, require_held_out
+from wiw.training.labelled_views import HELD_OUT_FIELD, LabelledViews, ViewRules, compute_view_tangents
+from wiw.training.preparation import PREPARATION, Preparation, ProgressBar, show_no_bar
 from wiw.training.trainer import apply_gradients, run_training, warmup_cosine_schedule
 
 LEAST_CELLS = 40
@@ -72,6 +77,66 @@ class Recipe:
     def __post_init__(self) -> None:
         if min(self.epochs, self.batch, *self.widths) < 1:
             raise ArgumentError(f"Recipe: epochs, batch and widths must be positive, got {self}")
+
+
+def make_weights(
+    out: Path,
+    scenes: str,
+    val: str,
+    rules: ViewRules = ViewRules(),
+    recipe: Recipe = Recipe(),
+    minutes: float | None = None,
+    preparation: Preparation = PREPARATION,
+    on_step: Callable[[int, int, float], None] = lambda step, steps, loss: None,
+    bar: ProgressBar = show_no_bar,
+) -> dict[str, Any]:
+    """Record views, train on them, or resume, calibrate colour words, evaluate on held-out scenes, and write both.
+
+    Colour words go into `OUT.colors.json`, without the suffix of `out`.
+
+    Args:
+        out: file of the weights; the state of training is kept beside it.
+        scenes: training scenes, as in `wiw run --scenes`.
+        val: held-out scenes.
+        rules: which views are recorded.
+        recipe: how to train; its seed is that of the views, too.
+        minutes: if given, reduces the number of epochs so that training takes about this long.
+        preparation: how views are recorded and cached.
+        on_step: called after each step with its number, the number of all steps and a running mean of the loss.
+        bar: shows the progress of recording.
+
+    Returns:
+        The card in the file.
+
+    Raises:
+        ArgumentError: scenes that are both trained and evaluated on; a state of another training.
+        FileError: a file cannot be written.
+    """
+    require_held_out(scenes, val)
+    gathering = preparation.list_arguments(bar)
+    views = gather_views(scenes, recipe.seed, rules, **gathering, change=True)
+    held_out_rules = replace(rules, fields=(HELD_OUT_FIELD, HELD_OUT_FIELD))
+    held_out = gather_views(val, recipe.seed, held_out_rules, **gathering, change=True)
+    card: dict[str, Any] = {"scenes": scenes, "val": val, "views": len(views), "sampling": asdict(rules)}
+    checkpoint = Checkpoint.beside(out, {**card, "recipe": asdict(recipe), "minutes": minutes})
+    with single_thread():
+        network, recipe = train(views, recipe, minutes, on_step, checkpoint)
+        namer = color_naming.calibrate(views, recipe.seed)
+    card |= {"recipe": asdict(recipe), "categories": list(CATEGORIES), "states": find_possible_states(views)}
+    save(out, network, card)  # before the evaluation, which takes another minute
+    colors = name_colors_file(out)
+    namer.save(colors)
+    network = load(out)[0]  # as it is stored, in half precision
+    card["held_out"] = evaluate(network, card["states"], held_out, recipe.seed)
+    card["held_out"]["colors"] = color_naming.evaluate(namer.load(colors), held_out)
+    save(out, network, card)
+    checkpoint.remove()
+    return card
+
+
+def name_colors_file(weights: Path) -> Path:
+    """Return the file of the colour words that belong to a file of weights."""
+    return weights.with_suffix(".colors.json")
 
 
 def train(

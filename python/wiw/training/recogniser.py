@@ -4,7 +4,8 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass, replace
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -13,11 +14,23 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from wiw._core import core
+from wiw.datasets.ar import CATEGORIES
 from wiw.errors import ArgumentError
 from wiw.perception.calibration import calibration_error, fit_temperature, softmax
 from wiw.perception.recogniser import Recogniser
 from wiw.perception.recognition_network import Network, to_network_input
-from wiw.training.glimpse_sets import NEAR, PERFECT, START, WARPED, GlimpseSets
+from wiw.training.gather import gather_glimpse_sets, gather_hard_sets, require_held_out
+from wiw.training.glimpse_sets import (
+    NEAR,
+    PERFECT,
+    START,
+    WARPED,
+    GlimpseSetRules,
+    GlimpseSets,
+    merge_glimpse_sets,
+    split_in_half,
+)
+from wiw.training.preparation import PREPARATION, Preparation, ProgressBar, show_no_bar
 from wiw.training.trainer import run_training, warmup_cosine_schedule
 
 REAL_COLUMN = 4
@@ -57,6 +70,58 @@ class Recipe:
     def __post_init__(self) -> None:
         if min(self.epochs, self.batch, self.width) < 1:
             raise ArgumentError(f"Recipe: epochs, batch and width must be positive, got {self}")
+
+
+def make_weights(
+    out: Path,
+    scenes: str,
+    val: str,
+    categories: Sequence[str] = CATEGORIES,
+    rules: GlimpseSetRules = GlimpseSetRules(),
+    recipe: Recipe = Recipe(),
+    minutes: float | None = None,
+    start: Recogniser | None = None,
+    preparation: Preparation = PREPARATION,
+    on_step: Callable[[int, int, float], None] = lambda step, steps, loss: None,
+    bar: ProgressBar = show_no_bar,
+) -> Recogniser:
+    """Record glimpses, train on them, calibrate and evaluate on the halves of held-out scenes, and write the weights.
+
+    Args:
+        out: file of the weights.
+        scenes: training scenes, as in `wiw run --scenes`.
+        val: held-out scenes.
+        categories: what is told apart.
+        rules: which glimpses are recorded.
+        recipe: how to train; its seed is that of the glimpses, too.
+        minutes: if given, reduces the number of epochs so that training takes about this long.
+        start: recogniser whose training goes on; None for random weights.
+        preparation: how glimpses are recorded and cached.
+        on_step: called after each step with its number, the number of all steps and a running mean of the loss.
+        bar: shows the progress of recording.
+
+    Returns:
+        The recogniser in the file, with its card.
+
+    Raises:
+        ArgumentError: scenes that are both trained and evaluated on, or show nothing of the categories; a start of
+            other categories or another width.
+        FileError: a file cannot be written.
+    """
+    require_held_out(scenes, val)
+    seed, gathering = recipe.seed, preparation.list_arguments(bar)
+    sets = gather_glimpse_sets(scenes, categories, seed, rules, **gathering)
+    hard = gather_hard_sets(scenes, categories, seed, **gathering)
+    held_out = gather_glimpse_sets(val, categories, seed, replace(rules, reshape=1.0), **gathering)
+    calibration, held_out = split_in_half(held_out)
+    held_out_hard = gather_hard_sets(val, categories, seed, **gathering)
+    samples = merge_glimpse_sets([sets, *[hard] * recipe.hard])
+    network, recipe = train(samples, categories, recipe, minutes, on_step, None if start is None else start.network)
+    card = {"scenes": scenes, "val": val, "sets": len(sets), "hard_sets": len(hard)}
+    card |= {"looks": asdict(rules), "recipe": asdict(recipe), "began_with": None if start is None else start.card}
+    calibrated = calibrate(network, categories, calibration, held_out, card, held_out_hard)
+    calibrated.save(out)
+    return calibrated
 
 
 def train(

@@ -4,7 +4,8 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Sequence
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -18,11 +19,14 @@ from wiw.datasets.worlds import world
 from wiw.errors import ArgumentError
 from wiw.networks import has_bfloat16
 from wiw.reproject import pose, warp
+from wiw.training.gather import gather_walks, require_held_out
+from wiw.training.preparation import PREPARATION, Preparation, ProgressBar, show_no_bar
 from wiw.training.reduced_frames import compute_log_distances
 from wiw.training.trainer import apply_gradients, run_training, warmup_cosine_schedule
-from wiw.training.walks import Walks, find_straight_paths
+from wiw.training.walks import WalkRules, Walks, find_straight_paths
 from wiw.world_models.warpnet.model import WarpNet, to_network
 from wiw.world_models.warpnet.network import Network, Prediction
+from wiw.world_models.warpnet.weights import load, save
 
 STRIDE = 0.2
 """Metres of a step ahead."""
@@ -56,6 +60,45 @@ class Recipe:
     def __post_init__(self) -> None:
         if min(self.epochs, self.batch, *self.widths) < 1:
             raise ArgumentError(f"Recipe: epochs, batch and widths must be positive, got {self}")
+
+
+def make_weights(
+    out: Path,
+    scenes: str,
+    val: str,
+    rules: WalkRules = WalkRules(),
+    recipe: Recipe = Recipe(),
+    minutes: float | None = None,
+    preparation: Preparation = PREPARATION,
+    on_step: Callable[[int, int, float], None] = lambda step, steps, loss: None,
+    bar: ProgressBar = show_no_bar,
+) -> dict[str, Any]:
+    """Record walks, train on them, evaluate on held-out scenes, and write the weights; return the file's card.
+
+    Args:
+        out: file of the weights.
+        scenes: training scenes, as in `wiw run --scenes`.
+        val: held-out scenes.
+        rules: which walks are recorded.
+        recipe: how to train; its seed is that of the walks, too.
+        minutes: if given, reduces the number of epochs so that training takes about this long.
+        preparation: how walks are recorded and cached.
+        on_step: called after each step with its number, the number of all steps and a running mean of the loss.
+        bar: shows the progress of recording and evaluation.
+
+    Raises:
+        ArgumentError: scenes that are both trained and evaluated on, or where nobody can walk straight ahead.
+        FileError: a file cannot be written.
+    """
+    require_held_out(scenes, val)
+    walks = gather_walks(scenes, recipe.seed, rules, **preparation.list_arguments(bar))
+    network, recipe = train(walks, recipe, minutes, on_step)
+    card: dict[str, Any] = {"scenes": scenes, "val": val, "ways": len(walks)}
+    card |= {"walks": asdict(rules), "recipe": asdict(recipe)}
+    save(out, network, card)  # before the evaluation, which takes another minute
+    card["held_out"] = evaluate(WarpNet(out), val, recipe.seed, bar=bar)
+    save(out, load(out)[0], card)
+    return card
 
 
 def train(

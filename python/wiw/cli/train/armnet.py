@@ -10,17 +10,9 @@ from typing import Annotated, Any
 
 from tyro.conf import arg
 
-from wiw.cli.train.progress import TrainingProgress
-from wiw.cli.train.small_networks import (
-    NO_LIMITS,
-    PREPARATION,
-    Count,
-    Limits,
-    Preparation,
-    check_counts,
-    drop_none,
-    write_weights,
-)
+from wiw.cli.train.progress import TrainingProgress, track_items
+from wiw.cli.train.small_networks import NO_LIMITS, Count, Limits, check_counts, drop_none, write_weights
+from wiw.training.preparation import PREPARATION, Preparation
 
 
 def train_armnet(
@@ -75,7 +67,7 @@ def _train(
     from wiw.training.plays import gather_plays, merge_plays, read_demonstration_plays
     from wiw.world_models.armnet.weights import load, save
 
-    recipe, seed, gathering = training.Recipe(**recipe_options), limits.seed, preparation.arguments
+    recipe, seed, gathering = training.Recipe(**recipe_options), limits.seed, preparation.list_arguments(track_items)
     plays = gather_plays(count, seed, **gathering)
     held_out = gather_plays(training.HELD_OUT, seed + training.HELD_OUT_SEED_OFFSET, **gathering)
     card: dict[str, Any] = {"plays": len(plays), "demonstrations": 0}

@@ -4,7 +4,6 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import asdict
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -44,51 +43,30 @@ def train_diffuser(
     check_counts(epochs=epochs)
     require_torch()
     with write_weights("diffuser", out):
-        _train(out, demonstrations, limits.minutes, drop_none({"epochs": epochs, "seed": limits.seed}))
+        if demonstrations is None:
+            raise ArgumentError(
+                "diffuser trains on demonstrations; give a folder of `wiw collect manipulation --depth` with "
+                "--demonstrations"
+            )
+        from wiw.training.diffuser import Recipe
+        from wiw.training.diffuser_weights import make_weights
+
+        recipe = Recipe(**drop_none({"epochs": epochs, "seed": limits.seed}))
+        with TrainingProgress() as progress:
+            card = make_weights(out, demonstrations, recipe, limits.minutes, progress, track_items)
+        _report(card)
     return 0
 
 
-def _train(out: Path, demonstrations: Path | None, minutes: float | None, recipe_options: Mapping[str, Any]) -> None:
-    from wiw.datasets.demonstrations import Demonstrations
-    from wiw.envs.sensors import Sensors
-    from wiw.networks import single_thread
-    from wiw.policies.diffuser.weights import save
-    from wiw.policies.diffuser.workspace import PinholeCamera
-    from wiw.training import diffuser as training
-    from wiw.training.checkpoint import Checkpoint
-    from wiw.training.diffuser_paths import measure_paths
-
-    if demonstrations is None:
-        raise ArgumentError(
-            "diffuser trains on demonstrations; give a folder of `wiw collect manipulation --depth` with "
-            "--demonstrations"
-        )
-    collection, recipe = Demonstrations(demonstrations), training.Recipe(**recipe_options)
-    if collection.config.get("size") != Sensors.size:
-        raise ArgumentError(
-            f"--demonstrations: diffuser needs views of {Sensors.size} x {Sensors.size} pixels, got demonstrations of "
-            f"{collection.config.get('size')}; collect with --size {Sensors.size}"
-        )
-    camera = PinholeCamera(collection.camera.intrinsics, collection.camera.T_world_camera)
-    read = track_items(collection, "reading", len(collection))
-    samples, held_out = training.extract_samples(read, camera, collection.wrist_intrinsics).hold_out()
-    card: dict[str, Any] = {"demonstrations": collection.config, "moments": len(samples), "held out": len(held_out)}
-    checkpoint = Checkpoint.beside(out, {**card, "recipe": asdict(recipe), "minutes": minutes})
-    with single_thread(), TrainingProgress() as progress:
-        network, recipe = training.train(samples, recipe, minutes, progress, checkpoint)
-        found = measure_paths(network, held_out) if len(held_out) else {}
-    save(out, network, {**card, "recipe": asdict(recipe), "found": found})
-    checkpoint.remove()
-    print(f"{len(collection)} demonstrations, {len(samples)} samples, {recipe.epochs} epochs")
-    if found:
-        _report(found, len(held_out))
-
-
-def _report(found: Mapping[str, float], count: int) -> None:
+def _report(card: Mapping[str, Any]) -> None:
     from wiw.training.diffuser_paths import PATHS
 
+    found = card["found"]
+    print(f"{card['moments']} samples, {card['recipe']['epochs']} epochs")
+    if not found:
+        return
     near = ", ".join(f"one of {paths} for {100 * found[f'near/{paths}']:.0f} %" for paths in PATHS)
     print(
-        f"held out  a path is the expert's, of {count} samples: {near}; the nearest of {max(PATHS)} is "
+        f"held out  a path is the expert's, of {card['held out']} samples: {near}; the nearest of {max(PATHS)} is "
         f"{1000 * found['off']:.0f} mm off, two paths end {1000 * found['spread']:.0f} mm apart"
     )

@@ -4,26 +4,23 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import asdict
 from pathlib import Path
 from typing import Annotated, Any
 
 from tyro.conf import arg
 
-from wiw.cli.train.progress import TrainingProgress
+from wiw.cli.train.progress import TrainingProgress, track_items
 from wiw.cli.train.small_networks import (
     NO_LIMITS,
-    PREPARATION,
     VAL_SCENES,
     Count,
     Limits,
-    Preparation,
     check_counts,
-    check_scenes,
     drop_none,
     to_percent,
     write_weights,
 )
+from wiw.training.preparation import PREPARATION, Preparation
 
 
 def train_navigator(
@@ -61,43 +58,18 @@ def train_navigator(
 
     check_counts(places=places, epochs=epochs)
     require_torch()
-    check_scenes(scenes, val)
     with write_weights("navigator", out):
-        recipe = drop_none({"epochs": epochs, "seed": limits.seed})
-        _train(out, scenes, val, limits, preparation, drop_none({"anchors": places}), recipe)
+        from wiw.training import navigator as training
+        from wiw.training.goal_places import PlaceRules
+
+        rules = PlaceRules(**drop_none({"anchors": places}))
+        recipe = training.Recipe(**drop_none({"epochs": epochs, "seed": limits.seed}))
+        with TrainingProgress() as progress:
+            card = training.make_weights(
+                out, scenes, val, rules, recipe, limits.minutes, preparation, progress, track_items
+            )
+        _report(card)
     return 0
-
-
-def _train(
-    out: Path,
-    scenes: str,
-    val: str,
-    limits: Limits,
-    preparation: Preparation,
-    rule_options: Mapping[str, Any],
-    recipe_options: Mapping[str, Any],
-) -> None:
-    from wiw.networks import single_thread
-    from wiw.policies.navigator.weights import load, save
-    from wiw.training import navigator as training
-    from wiw.training.checkpoint import Checkpoint
-    from wiw.training.gather import gather_goal_places
-    from wiw.training.goal_places import PlaceRules
-
-    rules, recipe, seed = PlaceRules(**rule_options), training.Recipe(**recipe_options), limits.seed
-    places = gather_goal_places(scenes, seed, rules, **preparation.arguments)
-    held_out = gather_goal_places(val, seed, rules, **preparation.arguments)
-    card: dict[str, Any] = {"scenes": scenes, "val": val, "places": sum(map(len, places))}
-    card |= {"sampling": asdict(rules)}
-    checkpoint = Checkpoint.beside(out, {**card, "recipe": asdict(recipe), "minutes": limits.minutes})
-    with single_thread(), TrainingProgress() as progress:
-        network, recipe = training.train(places, recipe, limits.minutes, progress, checkpoint)
-    card |= {"recipe": asdict(recipe), **training.measure_prior(places, recipe)}
-    save(out, network, card)  # before the evaluation, which takes another minute
-    card["held_out"] = training.evaluate(load(out)[0], card, held_out, seed)  # as stored, in half precision
-    save(out, network, card)
-    checkpoint.remove()
-    _report(card)
 
 
 def _report(card: Mapping[str, Any]) -> None:

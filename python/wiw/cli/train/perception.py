@@ -4,26 +4,23 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import asdict, replace
 from pathlib import Path
 from typing import Annotated, Any
 
 from tyro.conf import arg
 
-from wiw.cli.train.progress import TrainingProgress
+from wiw.cli.train.progress import TrainingProgress, track_items
 from wiw.cli.train.small_networks import (
     NO_LIMITS,
-    PREPARATION,
     VAL_SCENES,
     Count,
     Limits,
-    Preparation,
     check_counts,
-    check_scenes,
     drop_none,
     to_percent,
     write_weights,
 )
+from wiw.training.preparation import PREPARATION, Preparation
 
 
 def train_perception(
@@ -59,52 +56,19 @@ def train_perception(
 
     check_counts(places=places, epochs=epochs)
     require_torch()
-    check_scenes(scenes, val)
     with write_weights("perception", out):
-        recipe = drop_none({"epochs": epochs, "seed": limits.seed})
-        _train(out, scenes, val, limits, preparation, drop_none({"places": places}), recipe)
-    return 0
+        from wiw.training import perception as training
+        from wiw.training.labelled_views import ViewRules
 
-
-def _train(
-    out: Path,
-    scenes: str,
-    val: str,
-    limits: Limits,
-    preparation: Preparation,
-    rule_options: Mapping[str, Any],
-    recipe_options: Mapping[str, Any],
-) -> None:
-    from wiw.networks import single_thread
-    from wiw.perception.labeller_weights import load, save
-    from wiw.perception.scene_labels import CATEGORIES
-    from wiw.training import color_naming
-    from wiw.training import perception as training
-    from wiw.training.checkpoint import Checkpoint
-    from wiw.training.gather import gather_views
-    from wiw.training.labelled_views import HELD_OUT_FIELD, ViewRules
-
-    rules, recipe, seed = ViewRules(**rule_options), training.Recipe(**recipe_options), limits.seed
-    views = gather_views(scenes, seed, rules, **preparation.arguments, change=True)
-    held_out_rules = replace(rules, fields=(HELD_OUT_FIELD, HELD_OUT_FIELD))
-    held_out = gather_views(val, seed, held_out_rules, **preparation.arguments, change=True)
-    card: dict[str, Any] = {"scenes": scenes, "val": val, "views": len(views), "sampling": asdict(rules)}
-    checkpoint = Checkpoint.beside(out, {**card, "recipe": asdict(recipe), "minutes": limits.minutes})
-    with single_thread():
+        rules = ViewRules(**drop_none({"places": places}))
+        recipe = training.Recipe(**drop_none({"epochs": epochs, "seed": limits.seed}))
         with TrainingProgress() as progress:
-            network, recipe = training.train(views, recipe, limits.minutes, progress, checkpoint)
-        namer = color_naming.calibrate(views, seed)
-    card |= {"recipe": asdict(recipe), "categories": list(CATEGORIES), "states": training.find_possible_states(views)}
-    save(out, network, card)  # before the evaluation, which takes another minute
-    colors = out.with_suffix(".colors.json")
-    namer.save(colors)
-    network = load(out)[0]  # as it is stored, in half precision
-    card["held_out"] = training.evaluate(network, card["states"], held_out, seed)
-    card["held_out"]["colors"] = color_naming.evaluate(namer.load(colors), held_out)
-    save(out, network, card)
-    checkpoint.remove()
-    _report(card)
-    print(f"colours   {colors}")
+            card = training.make_weights(
+                out, scenes, val, rules, recipe, limits.minutes, preparation, progress, track_items
+            )
+        _report(card)
+        print(f"colours   {training.name_colors_file(out)}")
+    return 0
 
 
 def _report(card: Mapping[str, Any]) -> None:

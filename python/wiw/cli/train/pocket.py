@@ -12,16 +12,9 @@ from tyro.conf import arg
 from wiw.cli.options import Options
 from wiw.cli.train.corpus import TrackerName, describe_steps, require_data
 from wiw.cli.train.progress import TrainingProgress, track_items
-from wiw.cli.train.small_networks import (
-    VAL_SCENES,
-    Count,
-    Preparation,
-    check_counts,
-    check_seed,
-    drop_none,
-    write_weights,
-)
+from wiw.cli.train.small_networks import VAL_SCENES, Count, check_counts, check_seed, drop_none, write_weights
 from wiw.errors import ArgumentError
+from wiw.training.preparation import Preparation
 
 if TYPE_CHECKING:
     from wiw.datasets.navigation import NavigationData

@@ -26,13 +26,13 @@ class TrainingProgress:
         self._batch, self._unit, self._bars = batch, unit, Bars()
 
     def __enter__(self) -> TrainingProgress:
-        self._bars.__enter__()
         self._began = self._said = time.monotonic()
         self._first: int | None = None
         return self
 
     def __exit__(self, *_: object) -> None:
-        self._bars.__exit__()
+        if self._first is not None:
+            self._bars.__exit__()
 
     def show_validation(self, step: int, found: Mapping[str, float]) -> None:
         """Print the results of a validation."""
@@ -40,8 +40,9 @@ class TrainingProgress:
 
     def __call__(self, step: int, steps: int, loss: float) -> None:
         now = time.monotonic()
-        if self._first is None:  # the first step warms up, and comes after the weights were loaded
+        if self._first is None:  # the first step warms up, and comes after data and weights were loaded
             self._first, self._began = step, now
+            self._bars.__enter__()
         done = step - self._first
         rate = done / (now - self._began) if done else 0.0
         text = (
@@ -53,6 +54,8 @@ class TrainingProgress:
             left = f", {(steps - step) / rate / 60:.0f} min left" if rate and step < steps else ""
             print(f"training: {text}{left}", file=sys.stderr, flush=True)
             self._said = now
+        if step == steps:
+            self._bars.__exit__()
 
 
 def describe_validation(found: Mapping[str, float]) -> str:

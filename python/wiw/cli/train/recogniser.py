@@ -4,25 +4,14 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import asdict, replace
 from pathlib import Path
 from typing import Annotated, Any
 
 from tyro.conf import arg
 
-from wiw.cli.train.progress import TrainingProgress
-from wiw.cli.train.small_networks import (
-    NO_LIMITS,
-    PREPARATION,
-    VAL_SCENES,
-    Count,
-    Limits,
-    Preparation,
-    check_counts,
-    check_scenes,
-    drop_none,
-    write_weights,
-)
+from wiw.cli.train.progress import TrainingProgress, track_items
+from wiw.cli.train.small_networks import NO_LIMITS, VAL_SCENES, Count, Limits, check_counts, drop_none, write_weights
+from wiw.training.preparation import PREPARATION, Preparation
 
 
 def train_recogniser(
@@ -61,53 +50,24 @@ def train_recogniser(
         limits: Time limit and seed.
         preparation: How training data is prepared.
     """
-    from wiw.perception.recogniser import require_torch
+    from wiw.datasets.ar import CATEGORIES
+    from wiw.perception.recogniser import Recogniser, require_torch
 
     check_counts(places=places, epochs=epochs)
     require_torch()
-    check_scenes(scenes, val)
     with write_weights("recogniser", out):
-        recipe = drop_none({"epochs": epochs, "seed": limits.seed})
-        rules = drop_none({"places": places})
-        _train(out, scenes, val, categories, weights, limits, preparation, rules, recipe)
+        from wiw.training import recogniser as training
+        from wiw.training.glimpse_sets import GlimpseSetRules
+
+        names, start = categories or CATEGORIES, None if weights is None else Recogniser.load(weights)
+        rules = GlimpseSetRules(**drop_none({"places": places}))
+        recipe = training.Recipe(**drop_none({"epochs": epochs, "seed": limits.seed}))
+        with TrainingProgress() as progress:
+            made = training.make_weights(
+                out, scenes, val, names, rules, recipe, limits.minutes, start, preparation, progress, track_items
+            )
+        _report(made.card, made.temperature)
     return 0
-
-
-def _train(
-    out: Path,
-    scenes: str,
-    val: str,
-    categories: tuple[str, ...],
-    weights: str | None,
-    limits: Limits,
-    preparation: Preparation,
-    rule_options: Mapping[str, Any],
-    recipe_options: Mapping[str, Any],
-) -> None:
-    from wiw.datasets.ar import CATEGORIES
-    from wiw.perception.recogniser import Recogniser
-    from wiw.training import recogniser as training
-    from wiw.training.gather import gather_glimpse_sets, gather_hard_sets
-    from wiw.training.glimpse_sets import GlimpseSetRules, merge_glimpse_sets, split_in_half
-
-    names, seed, gathering = categories or CATEGORIES, limits.seed, preparation.arguments
-    rules, recipe = GlimpseSetRules(**rule_options), training.Recipe(**recipe_options)
-    start = None if weights is None else Recogniser.load(weights)
-    sets = gather_glimpse_sets(scenes, names, seed, rules, **gathering)
-    hard = gather_hard_sets(scenes, names, seed, **gathering)
-    held_out = gather_glimpse_sets(val, names, seed, replace(rules, reshape=1.0), **gathering)
-    calibration, held_out = split_in_half(held_out)
-    held_out_hard = gather_hard_sets(val, names, seed, **gathering)
-    samples = merge_glimpse_sets([sets, *[hard] * recipe.hard])
-    with TrainingProgress() as progress:
-        network, recipe = training.train(
-            samples, names, recipe, limits.minutes, progress, None if start is None else start.network
-        )
-    card = {"scenes": scenes, "val": val, "sets": len(sets), "hard_sets": len(hard)}
-    card |= {"looks": asdict(rules), "recipe": asdict(recipe), "began_with": None if start is None else start.card}
-    calibrated = training.calibrate(network, names, calibration, held_out, card, held_out_hard)
-    calibrated.save(out)
-    _report(calibrated.card, calibrated.temperature)
 
 
 def _report(card: Mapping[str, Any], temperature: float) -> None:

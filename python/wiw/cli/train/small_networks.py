@@ -13,7 +13,6 @@ from typing import Annotated, Any
 from tyro.conf import arg
 
 from wiw.cli.stop import announce_resume
-from wiw.cli.train.progress import track_items
 from wiw.errors import ArgumentError
 from wiw.training.launcher import require_single_process
 
@@ -41,35 +40,6 @@ def check_seed(seed: int) -> None:
 
 
 @dataclass(frozen=True, kw_only=True)
-class Preparation:
-    """How training data is prepared.
-
-    Raises:
-        ArgumentError: no workers.
-    """
-
-    workers: Annotated[int, arg(metavar="N")] = 2
-    """Number of processes that prepare the training data."""
-    cache: Annotated[Path | None, arg(metavar="DIR", help_behavior_hint="")] = None
-    """Folder for prepared training data, which can be deleted at any time. Default: $WIW_CACHE/looks."""
-
-    def __post_init__(self) -> None:
-        check_counts(workers=self.workers)
-
-    @property
-    def folder(self) -> Path:
-        """Folder of prepared training data."""
-        from wiw.scenes.store import folder
-
-        return self.cache or folder().parent / "looks"
-
-    @property
-    def arguments(self) -> dict[str, Any]:
-        """Keyword arguments of the functions in `wiw.training.gather`."""
-        return {"folder": self.folder, "workers": self.workers, "bar": track_items}
-
-
-@dataclass(frozen=True, kw_only=True)
 class Limits:
     """How long training may take, and its seed.
 
@@ -88,19 +58,7 @@ class Limits:
         check_seed(self.seed)
 
 
-NO_LIMITS, PREPARATION = Limits(), Preparation()
-
-
-def check_scenes(scenes: str, val: str) -> None:
-    """Check that no scene is used for both training and evaluation, whatever its path or an apartment's edits."""
-    from wiw.scenes import absolute, resolve, strip_edits
-
-    trained = {strip_edits(absolute(name)) for name in resolve(scenes)}
-    shared = next((name for name in resolve(val) if strip_edits(absolute(name)) in trained), None)
-    if shared is not None:
-        raise ArgumentError(
-            f"--val: expected held-out scenes that are not among --scenes, got {shared} in both; choose others"
-        )
+NO_LIMITS = Limits()
 
 
 @contextmanager

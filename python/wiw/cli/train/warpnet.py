@@ -4,25 +4,14 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import asdict
 from pathlib import Path
 from typing import Annotated, Any
 
 from tyro.conf import arg
 
 from wiw.cli.train.progress import TrainingProgress, track_items
-from wiw.cli.train.small_networks import (
-    NO_LIMITS,
-    PREPARATION,
-    VAL_SCENES,
-    Count,
-    Limits,
-    Preparation,
-    check_counts,
-    check_scenes,
-    drop_none,
-    write_weights,
-)
+from wiw.cli.train.small_networks import NO_LIMITS, VAL_SCENES, Count, Limits, check_counts, drop_none, write_weights
+from wiw.training.preparation import PREPARATION, Preparation
 
 
 def train_warpnet(
@@ -58,38 +47,18 @@ def train_warpnet(
 
     check_counts(places=places, epochs=epochs)
     require(WarpNet.requires)
-    check_scenes(scenes, val)
     with write_weights("warpnet", out):
-        recipe = drop_none({"epochs": epochs, "seed": limits.seed})
-        _train(out, scenes, val, limits, preparation, drop_none({"places": places}), recipe)
+        from wiw.training import warpnet as training
+        from wiw.training.walks import WalkRules
+
+        rules = WalkRules(**drop_none({"places": places}))
+        recipe = training.Recipe(**drop_none({"epochs": epochs, "seed": limits.seed}))
+        with TrainingProgress() as progress:
+            card = training.make_weights(
+                out, scenes, val, rules, recipe, limits.minutes, preparation, progress, track_items
+            )
+        _report(card)
     return 0
-
-
-def _train(
-    out: Path,
-    scenes: str,
-    val: str,
-    limits: Limits,
-    preparation: Preparation,
-    rule_options: Mapping[str, Any],
-    recipe_options: Mapping[str, Any],
-) -> None:
-    from wiw.training import warpnet as training
-    from wiw.training.gather import gather_walks
-    from wiw.training.walks import WalkRules
-    from wiw.world_models.warpnet.model import WarpNet
-    from wiw.world_models.warpnet.weights import load, save
-
-    rules, recipe = WalkRules(**rule_options), training.Recipe(**recipe_options)
-    walks = gather_walks(scenes, limits.seed, rules, **preparation.arguments)
-    with TrainingProgress() as progress:
-        network, recipe = training.train(walks, recipe, limits.minutes, progress)
-    card: dict[str, Any] = {"scenes": scenes, "val": val, "ways": len(walks)}
-    card |= {"walks": asdict(rules), "recipe": asdict(recipe)}
-    save(out, network, card)  # before the evaluation, which takes another minute
-    card["held_out"] = training.evaluate(WarpNet(out), val, limits.seed, bar=track_items)
-    save(out, load(out)[0], card)
-    _report(card)
 
 
 def _report(card: Mapping[str, Any]) -> None:
