@@ -143,7 +143,7 @@ class Summary:
     departures: tuple[Departure, ...] = field(default=(), kw_only=True)
     """Where the run departs from the paper's protocol."""
     tiers: Mapping[str, Summary] = field(default_factory=dict, kw_only=True)
-    """The same numbers of each tier of episodes by itself, where the run has several."""
+    """The same numbers for each tier of episodes separately, where the run has several."""
 
     @property
     def protocol(self) -> str:
@@ -385,7 +385,7 @@ def arm_table(run: Run) -> Records:
 
 
 def tier_table(run: Run) -> Records:
-    """Return the same of each tier of episodes by itself, with its name as "tier"; empty without several."""
+    """Return the same for each tier of episodes separately, with its name as "tier"; empty unless there are several."""
     tiers = summarise_run(run).tiers
     return Records({"tier": tier, **line} for tier, own in tiers.items() for line in _list_lines(own))
 
@@ -623,8 +623,8 @@ def _explain_differences(summary: Summary) -> list[str]:
     elif first.scenes < FEWEST_SCENES:
         what = "the interval's t test, as there are too few scenes for an exact one"
     return [
-        f"p: {what}, Holm-adjusted over the arms in its table. Bold: adjusted p of at most {LEVEL:g}, for SR by "
-        "itself, for the other columns together. Intervals are not adjusted."
+        f"p: {what}, Holm-adjusted over the arms in its table. Bold: adjusted p of at most {LEVEL:g} (SR's "
+        "p values are adjusted on their own, those of the other columns together). Intervals are not adjusted."
     ]
 
 

@@ -115,8 +115,8 @@ def cancel(run: Positional[Annotated[Path, arg(metavar="RUN")]], /) -> int:
     """
     from wiw.runs.submission import cancel as cancel_jobs
 
-    told = cancel_jobs(run)
-    print(f"{run}: told {len(told)} jobs to end")
+    canceled = cancel_jobs(run)
+    print(f"{run}: canceled {len(canceled)} jobs")
     return 0
 
 

@@ -49,7 +49,7 @@ class FrameTracker(Tracker):
         panoramic: bool,
         real: Sequence[int],
     ) -> list[NDArray[np.bool_]]:
-        """Follow each plan by itself; a target that is out of sight all around gets empty masks."""
+        """Track the target along each plan separately; masks are empty where it is out of sight all around."""
         follow = self._follow_panoramas if panoramic else self._follow_front_views
         found = []
         for observation, poses, images, count in zip(observations, viewpoints, frames, real, strict=True):

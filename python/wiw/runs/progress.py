@@ -265,7 +265,7 @@ def make_board(wanted: bool) -> Board:
 
 
 def in_notebook() -> bool:
-    """Return whether the value of a cell is shown by itself, so that printing it would show it twice."""
+    """Return whether a notebook shows the value of this cell, so that printing it would show it twice."""
     if "IPython" not in sys.modules:  # a notebook has it loaded, and elsewhere loading it takes longer than a short run
         return False
     from IPython import get_ipython

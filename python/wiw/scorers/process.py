@@ -44,7 +44,7 @@ QUOTED = 300
 MOST_WAITING = 1024
 """Lines that are read ahead."""
 GRACE = 2.0
-"""Seconds that a scorer has to end by itself when it is closed."""
+"""Seconds that a scorer has to exit on its own once it is closed."""
 
 
 class ProcessScorer:

@@ -50,11 +50,13 @@ class DecisionRules:
     def __post_init__(self) -> None:
         if not 2 <= self.plans <= HEADINGS or self.least_steps < 1 or self.actions < HEADINGS // 2 + self.least_steps:
             raise ArgumentError(
-                f"decisions: expected 2 to {HEADINGS} plans, least_steps of 1 or more, and {HEADINGS // 2} actions "
-                f"more than that, for turns to any heading; got {self}"
+                f"decisions: expected 2 to {HEADINGS} plans, least_steps of 1 or more, and at least "
+                f"{HEADINGS // 2} actions more than least_steps, so that any heading can be turned to; got {self}"
             )
         if not 0 < self.goal_shortest < self.goal_longest or min(self.size) < 16:
-            raise ArgumentError(f"decisions: expected goals from above 0 m on and pictures of 16 rows, got {self}")
+            raise ArgumentError(
+                f"decisions: expected 0 < goal_shortest < goal_longest and images of at least 16 pixels a side, got {self}"
+            )
 
 
 def collect_decisions(

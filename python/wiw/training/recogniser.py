@@ -151,7 +151,9 @@ def train(
             f"{start.categories} and {start.width}"
         )
     if start is not None and start.sizes and not recipe.sizes:
-        raise ArgumentError("recogniser: expected a recipe with sizes, as the start is told them, got one without")
+        raise ArgumentError(
+            "recogniser: the weights to start from use sizes, so the recipe must, too; expected sizes=True, got False"
+        )
     steps_per_epoch = max(1, len(data) // recipe.batch)
     trainer, recipe = run_training(
         lambda: _Trainer(data, categories, recipe, start),

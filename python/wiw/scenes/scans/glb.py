@@ -74,7 +74,7 @@ class Glb:
         """Return the bytes of a buffer view."""
         view = self.items("bufferViews")[index]
         if view.get("buffer", 0) != 0:
-            raise ValueError(f"buffer view {index} lies in another file")
+            raise ValueError(f"buffer view {index} is in another file")
         start, length = int(view.get("byteOffset", 0)), int(view["byteLength"])
         if start < 0 or length < 0 or start + length > len(self.body):
             raise ValueError(f"buffer view {index} reaches beyond the file")
