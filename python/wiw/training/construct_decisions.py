@@ -55,7 +55,8 @@ class DecisionRules:
             )
         if not 0 < self.goal_shortest < self.goal_longest or min(self.size) < 16:
             raise ArgumentError(
-                f"decisions: expected 0 < goal_shortest < goal_longest and images of at least 16 pixels a side, got {self}"
+                "decisions: expected 0 < goal_shortest < goal_longest, and panoramas of at least 16 rows and columns, "
+                f"got {self}"
             )
 
 
