@@ -52,7 +52,7 @@ def memory_guard(what: str, cures: str) -> Iterator[None]:
     """Turn out-of-memory errors into one that says how to use less memory.
 
     Raises:
-        DeviceMemoryError: there is no memory left.
+        DeviceMemoryError: the memory is exhausted.
     """
     import torch
 
@@ -85,7 +85,7 @@ def is_path(name: str) -> bool:
 
 
 def explain_hub_error(error: BaseException, name: str, revision: str | None) -> WeightsError:
-    """Return a `WeightsError` that tells the user what an error of the hub's client means."""
+    """Return a `WeightsError` that explains an error of the hub's client to the user."""
     from huggingface_hub import errors
 
     chain = list(_walk_causes(error))

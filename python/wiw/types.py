@@ -252,9 +252,9 @@ class Wording:
     lost: str = "not succeeded"
     """The outcome of any other episode, e.g. "not reached"."""
     goal: str = "goal"
-    """What distances are measured to."""
+    """The point to which distances are measured."""
     way: str = "to the goal"
-    """Where an episode's shortest path leads."""
+    """The end of an episode's shortest path."""
     asked: str = "The goal"
     """Caption of the goal, e.g. "The goal: find where this was taken"."""
     steps: str = "primitives"
@@ -461,7 +461,7 @@ class Exchange:
     """A question to a language model during a decision, and its outcome."""
 
     purpose: str
-    """What the policy wanted, such as "propose/0" or "answer"."""
+    """The purpose of the call, such as "propose/0" or "answer"."""
     model: str
     said: tuple[Mapping[str, Any], ...]
     """Every completion: `call` (the digest of its question), `text`, `finish`, `logprobs`, `prompt_tokens`,
@@ -471,7 +471,7 @@ class Exchange:
     problem: str = ""
     """Why the answer could not be used, "<kind>: <detail>"; empty if it could."""
     instead: str = ""
-    """What the policy did instead."""
+    """The policy's fallback."""
 
 
 @dataclass(frozen=True)
@@ -541,7 +541,7 @@ class Episode:
     info: Mapping[str, Any] = field(default_factory=dict)
     """ImageNav reads "ideal_primitives" (the smallest number of primitives), "radius" (the goal's own, in metres) and
     "goal_image" (the file of a panorama at the goal); "tier" is the tier it was generated for. AR reads "target", an
-    instance's id, and "category", what it is. Manipulation reads "task", "seed" and "variation", and tells reports the
+    instance's id, and "category", what it is. Manipulation reads "task", "seed" and "variation", and gives reports the
     "instruction"."""
 
     @property
@@ -597,7 +597,7 @@ class EpisodeResult:
     error: str = ""
     """Traceback."""
     kind: str = ""
-    """What failed: "environment", "agent", "worker" (its process died), "world_model/" and a `RolloutError.kind`,
-    "vlm/" and a `VlmError.kind`, or "judge/" and a `JudgeError.kind`."""
+    """The part that failed: "environment", "agent", "worker" (its process died), "world_model/" and a
+    `RolloutError.kind`, "vlm/" and a `VlmError.kind`, or "judge/" and a `JudgeError.kind`."""
     details: Mapping[str, Any] = field(default_factory=dict)
     """Facts about the episode other than numbers, as JSON. A-EQA: "answer" and its "judgement"."""

@@ -45,7 +45,7 @@ class WeightFile(Generic[N]):
         """Load the network and its card.
 
         Raises:
-            WeightsError: there is no such file, or it is damaged, of another version or of something else.
+            WeightsError: it does not exist, is damaged, has another version, or holds something else.
         """
         path = Path(path).expanduser()
         if not path.is_file():

@@ -206,7 +206,7 @@ def generate(
     Otherwise the episodes are a function of (scene, seed, `first`).
 
     Raises:
-        ArgumentError: the scene holds nothing of `categories`, or too few targets and starts satisfy `rules`.
+        ArgumentError: the scene has no object of `categories`, or too few targets and starts satisfy `rules`.
     """
     key = core.fold_key([seed, first, 0xA12])
     things = _targets(world, categories)
@@ -318,7 +318,7 @@ def _episode(
 
 
 def _find_reason(size: float, share: float, averted: bool, best: _View, rules: EpisodeRules) -> str | None:
-    """Return why a first look is hard where the best view mends it; None if it is not, or where that does not."""
+    """Return why the first view is hard where the best view resolves it; None if it is not, or where that does not."""
     if averted:
         return AVERTED_LOOK
     if best.size < rules.gain * size:

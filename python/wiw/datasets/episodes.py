@@ -142,4 +142,4 @@ _FIELDS: Mapping[str, Callable[[Any, str], Any]] = {
     "geodesic": _length,
 }
 _INFO: Mapping[str, Callable[[Any, str], Any]] = {"ideal_primitives": integer, "radius": number, "best_position": point}
-"""What tasks compute with."""
+"""Fields that tasks compute with."""

@@ -21,7 +21,7 @@ Order = Literal["xyzw", "wxyz"]
 PUBLISHED = "world-in-world"
 """Source of episodes that the paper's authors have published, as `Episode.info` names it."""
 _UNREADABLE = (LookupError, TypeError, ValueError, ArithmeticError, AttributeError)
-"""What an item of another shape raises."""
+"""Exceptions raised for an item of another shape."""
 
 
 def yaw_of(quaternion: Sequence[float], order: Order, where: str) -> float:
@@ -153,7 +153,7 @@ def read_active_recognition(body: Mapping[str, Any], path: str) -> list[Episode]
     """Read episodes of the published AR file (`start_rotation` in order wxyz, the category's key misspelt).
 
     Scene paths are those of the authors' disk, so that only folder and file name are kept, relative to the scene
-    folder. The place of a target is known by its instance alone; until the scene tells, the goal's position is NaN.
+    folder. The place of a target is known by its instance alone; until the scene is open, the goal's position is NaN.
     """
     return [_active_recognition(item, f"{path}: episode {i}") for i, item in enumerate(body["episodes"])]
 

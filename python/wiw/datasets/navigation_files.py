@@ -130,7 +130,7 @@ class FrameFile(RowGroupFile):
     """A file of frames that is read segment by segment.
 
     Raises:
-        FileError: it does not exist, is damaged, or is none of ours.
+        FileError: it does not exist, is damaged, or was not written by wiw.
     """
 
     def __init__(self, path: Path) -> None:

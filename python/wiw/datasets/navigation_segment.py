@@ -83,7 +83,7 @@ class NavigationSegment:
         return self._show(self.encoded_depths, cv2.IMREAD_UNCHANGED).astype(np.float32) / np.float32(DEPTH_UNITS)
 
     def clip(self, start: int, length: int) -> NavigationSegment:
-        """Return `length` frames from frame `start` as a segment of its own, whose first action is Null.
+        """Return `length` frames from frame `start` as a separate segment, whose first action is Null.
 
         Raises:
             ArgumentError: the segment does not have these frames.
@@ -162,7 +162,7 @@ def encode_color(image: NDArray[np.uint8], lossless: bool) -> bytes:
 
 
 def encode_millimetres(depth: NDArray[np.float32]) -> bytes:
-    """Encode metres float32 [H, W] as a 16-bit PNG in millimetres; 65.535 m stands for all that is further away."""
+    """Encode metres float32 [H, W] as a 16-bit PNG in millimetres; 65.535 m stands for anything farther away."""
     return encode_units(np.clip(np.rint(depth * DEPTH_UNITS), 0, np.iinfo(np.uint16).max).astype(np.uint16))
 
 

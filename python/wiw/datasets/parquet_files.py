@@ -46,7 +46,7 @@ def image_values(pictures: Sequence[bytes | None]) -> list[dict[str, Any] | None
 
 
 def build_schema(types: Mapping[str, Any], facts: Mapping[str, Any]) -> Any:
-    """Return an Arrow schema whose metadata hold `facts` and tell `datasets` how to decode each column."""
+    """Return an Arrow schema whose metadata hold `facts` and say how `datasets` decodes each column."""
     import pyarrow as pa
 
     features = {"info": {"features": {name: _feature(kind) for name, kind in types.items()}}}
@@ -144,7 +144,7 @@ class RowGroupFile:
             raise self.build_damage_error(error) from error
 
     def build_damage_error(self, error: Exception) -> FileError:
-        """Return the error that tells what to do about a damaged file."""
+        """Return an error that says what to do about a damaged file."""
         return FileError(
             f"{self.path}: expected a complete file of {self._what}, got a damaged one ({error}); delete it and "
             "recreate it by repeating the `wiw collect` command"

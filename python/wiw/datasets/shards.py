@@ -69,7 +69,7 @@ class Shard(RowGroupFile):
     """A file that is read demonstration by demonstration.
 
     Raises:
-        FileError: it does not exist, is damaged, or is none of ours.
+        FileError: it does not exist, is damaged, or was not written by wiw.
     """
 
     def __init__(self, path: Path) -> None:

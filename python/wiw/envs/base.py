@@ -90,7 +90,7 @@ class Env(ABC):
         """Return the metrics of the running episode, "success" (0 or 1) among them."""
 
     def details(self) -> Mapping[str, Any]:
-        """Return what is recorded of the running episode besides its metrics, as JSON-able values."""
+        """Return the JSON-able values recorded of the running episode besides its metrics."""
         return {}
 
     def fork(self) -> Any:

@@ -71,7 +71,7 @@ class NavigationSpec(ABC):
         """Return an episode by its number."""
 
     def locate(self, place: World, episode: Episode) -> Episode:
-        """Return an episode with everything that only its open scene tells; most tell it beforehand."""
+        """Return an episode with everything that is only known once its scene is open; most have it already."""
         return episode
 
     @abstractmethod
@@ -248,7 +248,7 @@ def observe_place(task: NavigationSpec, core: Any, state: EpisodeState, depth: b
     """Return what the agent sees from where the simulator stands.
 
     The panorama, and its depth, are drawn now for whoever decides next, and with the episode over only if somebody
-    looks; so is the front view always. Where the task points something out, everything is drawn for its sake.
+    looks; so is the front view always. Where the task has a target, everything is rendered to find its box.
     """
     if task.pointing is not None:
         return make_observation(task, core.observe(image_names(task, depth)), core.odometry, state)
@@ -269,8 +269,8 @@ def make_observation(
 def round_odometry(odometry: NDArray[np.float64]) -> NDArray[np.float64]:
     """Return odometry [..., 3] to a tenth of a millimetre.
 
-    The simulator's positions are float32 in the scene's frame. How differences of such numbers are rounded tells which
-    of some given starts they are relative to; to a tenth of a millimetre they do not.
+    The simulator's positions are float32 in the scene's frame. The rounding of differences of such numbers reveals
+    which of some given starts they are relative to; to a tenth of a millimetre they do not.
     """
     rounded = odometry.copy()
     rounded[..., :2] = np.round(odometry[..., :2], 4) + 0.0  # no negative zeros

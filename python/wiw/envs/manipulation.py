@@ -33,7 +33,7 @@ class ManipulationEnv(gymnasium.Env[dict[str, Any], NDArray[np.float64]], Env):
     way that leads into the table or out of reach is gone as far as it is free, and recorded. Success is rewarded by 1.
 
     Observations are dicts: "front" uint8 [size, size, 3]; "pose" float64 [7], "joints" float64 [9] (the Panda's and its
-    fingers') and "held" (1 while the gripper holds something). What is asked for comes on top, by each camera.
+    fingers') and "held" (1 while the gripper holds something). Requested inputs come on top, for each camera.
 
     Args:
         task: whose episodes are run.
@@ -96,7 +96,7 @@ class ManipulationEnv(gymnasium.Env[dict[str, Any], NDArray[np.float64]], Env):
         return self._read_sensors(), info
 
     def step(self, action: ArrayLike) -> tuple[dict[str, Any], float, bool, bool, dict[str, Any]]:
-        """Go to one pose, which is a decision of its own.
+        """Go to one pose, which counts as one decision.
 
         Raises:
             ArgumentError: no finite pose [7] with a gripper from 0 to 1, nor, with `grid`, whole numbers [7]; nothing

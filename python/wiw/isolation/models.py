@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """World models of one's own, each in a separate process.
 
-`find_isolated_model` returns a class that stands for the one behind a name: it tells the same about itself, and an
+`find_isolated_model` returns a class that stands for the one behind a name: it describes itself in the same way, and an
 instance of it passes each rollout on to the instance in its process. Nothing of the model's code is imported here.
 """
 
@@ -86,7 +86,7 @@ class IsolatedModel(Isolated, WorldModel):
     Raises:
         ConstructionError: the constructor raised, did not return in time, or ended its process; and errors of wiw that
             it raised.
-        ArgumentError: the model asks for the simulator.
+        ArgumentError: the model requires the simulator.
     """
 
     def __new__(cls, isolate: bool = True, memory_gb: float | None = None, **options: Any) -> Any:
@@ -178,7 +178,7 @@ def _make_again(name: str, options: Mapping[str, Any]) -> Any:
 
 
 def load_model(host: Host, name: str) -> dict[str, Any]:
-    """Import the class or factory behind a name; return what it tells before it is called."""
+    """Import the class or factory behind a name; return its description, which is available before any call."""
     host.thing = thing = WORLD_MODELS.find_here(name)
     host.make = partial(WORLD_MODELS.make_here, name)
     declared, requires = getattr(thing, "accepts", None), getattr(thing, "requires", Requirements())
@@ -214,7 +214,7 @@ def fingerprint_model(host: Host) -> str:
 def roll_out(
     host: Host, observations: Conditioning, controls: Sequence[Control], seeds: NDArray[np.uint64], seconds: float
 ) -> dict[str, float]:
-    """Write the model's frames into the memory of the answer; return what it has used up so far."""
+    """Write the model's frames into the memory of the answer; return what it has consumed so far."""
     with answer_deadline(seconds):
         frames = host.made.rollout(observations, controls, seeds)
     require_frames(host.made, frames, observations, controls)

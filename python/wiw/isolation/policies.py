@@ -57,7 +57,7 @@ def _make_class(name: str, state: tuple[str, int, int] | None) -> type[IsolatedP
 
 
 class _MemoryHandle:
-    """Stands for the memory of an episode that lies in the policy's process."""
+    """Handle of an episode's memory, which stays in the policy's process."""
 
     def __init__(self, number: int) -> None:
         self.number = number
@@ -228,7 +228,7 @@ def _read_answer(told: Any) -> Answer | TextAnswer | None:
 
 
 def load_policy(host: Host, name: str) -> dict[str, Any]:
-    """Import the class or factory behind a name; return what it tells before it is called."""
+    """Import the class or factory behind a name; return its description, which is available before any call."""
     host.thing = POLICIES.find_here(name)
     host.make = partial(POLICIES.make_here, name)
     return {**describe_class(host.thing), **_declare(host.thing)}

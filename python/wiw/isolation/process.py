@@ -242,7 +242,7 @@ def _starter() -> ThreadPoolExecutor:
 
 
 def _open(command: list[str], descriptor: int) -> subprocess.Popen[bytes]:
-    """Start a child in a process group of its own, without input; what it prints goes to standard error."""
+    """Start a child in its own process group, without input; its output goes to standard error."""
     return subprocess.Popen(
         command,
         stdin=subprocess.DEVNULL,
@@ -274,7 +274,7 @@ def _take_out(buffer: pickle.PickleBuffer, arrays: list[NDArray[np.uint8]]) -> b
 
 
 def _build_error(told: Any) -> Exception:
-    """Return the exception that a child has told of: one of wiw's own, or what stands for somebody else's."""
+    """Return the exception that a child has reported: one of wiw's own, or a substitute for a foreign one."""
     told = told if isinstance(told, dict) else {}
     text = str(told.get("text", ""))
     name, kind = str(told.get("type", "")), told.get("kind")

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Code of somebody else's, imported in processes of its own: what it says of its class, and processes to make it in."""
+"""A user's code, imported in separate processes: the description of its class, and processes to build it in."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ _SOURCES: weakref.WeakSet[Source] = weakref.WeakSet()
 
 
 def end_idle_processes() -> None:
-    """End the processes that have only told what their code says of itself, where other processes will run it."""
+    """End the processes that have only described their code, where other processes will run it."""
     for source in list(_SOURCES):
         source.end_idle()
 
@@ -67,7 +67,7 @@ class Source:
 
         Raises:
             RegistryError: it cannot be imported.
-            InfrastructureError: it is not what it was when it was imported first.
+            InfrastructureError: it has changed since it was first imported.
         """
         try:
             told: dict[str, Any] = process.call(self._load, self.name)[0]
@@ -153,7 +153,7 @@ class Isolated:
 
 
 def read_file_state(name: str) -> tuple[str, int, int] | None:
-    """Return what tells versions of the file of "path.py:Class" apart; None for a name without a file."""
+    """Return an identifier of the version of the file in "path.py:Class"; None for a name without a file."""
     path = Path(name.rpartition(":")[0]).expanduser()
     if path.suffix != ".py" or not path.is_file():
         return None
@@ -162,7 +162,7 @@ def read_file_state(name: str) -> tuple[str, int, int] | None:
 
 
 def describe_class(thing: Any) -> dict[str, Any]:
-    """Return what a class or factory tells of itself before it is called."""
+    """Return the description of a class or factory, which is available before it is called."""
     makes = inspect.isclass(thing) or inspect.isroutine(thing) or isinstance(thing, partial)
     return {
         "name": str(getattr(thing, "__name__", type(thing).__name__)),

@@ -57,7 +57,7 @@ def check_needs(model: WorldModel) -> None:
     """Check that no model but the oracle needs the simulator.
 
     Raises:
-        ArgumentError: another model asks for it.
+        ArgumentError: another model requires it.
     """
     if "simulator" in model.accepts.needs and not isinstance(model.unwrapped, Oracle):
         raise ArgumentError(
@@ -116,7 +116,7 @@ def check_scores(policy: Policy, scores: Any, proposals: Sequence[Sequence[Propo
 
 
 def check_answerer(policy: Policy, goal: Goal) -> None:
-    """Refuse a reviser that gives no answer where the goal asks for one.
+    """Refuse a reviser that gives no answer where the goal requires one.
 
     Raises:
         ContractError: it has not written `answer`.

@@ -2,7 +2,7 @@
 """Requests to imagine plans, and their results.
 
 An `Imaginer` is a world model as the loop asks it: `ModelImaginer` asks the model for the very plans from the very
-observations. Experiments wrap one to ask for something else (`wiw.experiments`).
+observations. Experiments wrap one to request something else (`wiw.experiments`).
 """
 
 from __future__ import annotations
@@ -64,7 +64,7 @@ class Imagination(ABC):
     rollouts: Sequence[Sequence[Rollout] | None]
     """[episode][candidate]; None for an episode of which nothing was imagined."""
     costs: Sequence[Mapping[str, int]]
-    """What each episode asked for: consultations, rows and frames."""
+    """What each episode requested: consultations, rows and frames."""
     view: View = "perspective"
     """That the model imagines."""
     source_size: tuple[int, int] | None = None

@@ -125,7 +125,7 @@ def _build_conditioning(accepts: Accepts, batch: Any, inputs: Sequence[ModelInpu
 
 
 def _label_starts(accepts: Accepts, batch: Any, inputs: Sequence[ModelInput]) -> NDArray[np.uint32]:
-    """Return the labels of what each row begins with, none of them blended.
+    """Return the labels at the start of each row, without blending.
 
     Raises:
         ArgumentError: an episode has none.

@@ -20,7 +20,7 @@ from wiw.world_models.base import Accepts
 
 @dataclass(frozen=True)
 class Query:
-    """One live episode that asks for a decision: what an agent may know of it."""
+    """One live episode that is due for a decision: what an agent may know of it."""
 
     observation: Observation | ArmObservation
     goal: Goal

@@ -30,7 +30,7 @@ class LiveEnvironments:
         self._by_episode.pop((key.seed, key.episode), None)
 
     def find(self, key: Key) -> Any:
-        """Return the environment of an episode, as it stands.
+        """Return the environment of an episode in its current state.
 
         Raises:
             ArgumentError: nobody has granted it.
@@ -49,7 +49,7 @@ class Privileged(ABC):
 
     @abstractmethod
     def grant(self, environments: LiveEnvironments) -> None:
-        """Take the environments that the episodes to come are run in."""
+        """Take the environments in which the next episodes are run."""
 
 
 class ForkedEnvironment:

@@ -92,7 +92,7 @@ def run_episodes(
     `pictured`.
 
     An exception in an episode is infrastructure: the episode is recorded as an error and the rest continue. One in a
-    batch may be due to any of its episodes, so each of them is run again by itself, after the others: what breaks does
+    batch may be due to any of its episodes, so each of them is run again on its own, after the others: what breaks does
     not depend on what else was live. A policy's broken contract or a wrong argument would hit every episode alike, so
     it is raised; so is what the sink raises.
     """

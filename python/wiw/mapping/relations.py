@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""How mapped objects stand to each other: on, above, beside, around, in one room.
+"""Spatial relations of mapped objects: on, above, beside, around, in one room.
 
 Boxes are along the axes of the frame of the start, which need not be those of the walls; what touches is therefore
 measured between voxels wherever an oblique box would mislead.

@@ -2,7 +2,7 @@
 """LPIPS, the perceptual distance of Zhang et al. 2018, version 0.1 on AlexNet's features.
 
 Two published files make it what papers call LPIPS; they are identified by their SHA-256. Without them there is no
-number: nothing stands in for them.
+value: there is no substitute.
 """
 
 from __future__ import annotations

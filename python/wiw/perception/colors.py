@@ -77,7 +77,7 @@ class ColorNamer:
         """Read the JSON file that `save` wrote.
 
         Raises:
-            WeightsError: there is no such file, or it is damaged or of something else.
+            WeightsError: it does not exist, is damaged, or holds something else.
         """
         try:
             values = json.loads(Path(path).expanduser().read_text())

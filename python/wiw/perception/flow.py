@@ -44,7 +44,7 @@ class Flow(FrameTracker):
     (Kalal et al., ICPR 2010), and moves the mask by the similarity that most of them agree on.
 
     Each frame is compared with the one that showed the target last, and then with the seed. Where too few corners agree
-    or the moved target is not like the frame, the target is lost. Nothing is learned, and parts that come into sight
+    or the moved target differs from the frame, the target is lost. Nothing is learned, and parts that come into sight
     are not added to the mask.
     """
 
@@ -117,7 +117,7 @@ def _follow_corners(image: Grey, frame: Grey, start: Any, guess: Any) -> tuple[N
 
 
 def _move_mask(image: Grey, mask: Mask, frame: Grey, motion: Any) -> Mask | None:
-    """Return the mask, moved; None if it leaves the frame, changes its size much, or the frame is unlike it."""
+    """Return the mask, moved; None if it leaves the frame, changes its size a lot, or differs from the frame."""
     size = frame.shape[::-1]
     moved = np.asarray(cv2.warpAffine(mask.astype(np.uint8) * 255, motion, size)) > 127
     if not moved.any() or not 1 / LARGEST_SCALE < np.hypot(*motion[0, :2]) < LARGEST_SCALE:

@@ -23,8 +23,8 @@ class FrameTracker(Tracker):
     with.
 
     These turns are the real panorama, turned, and so is the target's mask. Imagined frames are followed from the real
-    view after them. A front view that shows nothing of the target is led up to by real views: from the one that faces
-    the target, turn by turn.
+    view after them. A front view without the target is preceded by real views: from the one that faces the target, turn
+    by turn.
     """
 
     follows = "frames"

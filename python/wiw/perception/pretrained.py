@@ -33,7 +33,7 @@ def load_network(loader: str, kinds: Sequence[str], weights: str | Path, revisio
 
     Raises:
         DependencyError: torch or transformers is not installed.
-        WeightsError: there are no such weights, or they belong to another network.
+        WeightsError: the weights do not exist, or belong to another network.
         ArgumentError: a revision was given for a folder.
     """
     transformers = import_transformers()

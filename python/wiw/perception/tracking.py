@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Trackers, which locate the target in imagined frames: their interface, and the one that needs geometry alone.
+"""Trackers, which locate the target in imagined frames: their interface, and the one that only needs geometry.
 
-`Reprojection` shows where the target would be if a frame showed what its plan asked for: for world models that are told
+`Reprojection` shows where the target would be if a frame showed what its plan asked for: for world models that take
 poses. `wiw.perception.frame_tracking` has those that look at the frames.
 """
 
@@ -182,7 +182,7 @@ def reproject_masks(
     size: tuple[int, int],
     hfov_deg: float | None = None,
 ) -> tuple[NDArray[np.bool_], NDArray[np.bool_]]:
-    """Return masks of a panorama as seen from other poses, bool [T, K, h, w]; three cost as much as one.
+    """Return masks of a panorama as seen from other poses, bool [T, K, h, w]; three take as long as one.
 
     Also returns what the panorama did not show of the new views, bool [K, h, w].
 

@@ -92,8 +92,8 @@ def temporary(build: Callable[[Path], Any]) -> _core.scene.Scene:
 def load_generated(identity: Iterable[str | int], make: Callable[[], _core.scene.Scene]) -> _core.scene.Scene:
     """Return a scene that depends on `identity` (generator, version, seed, ...) alone: mapped, or generated.
 
-    Processes that ask for the same scene at the same time make it once. Where it cannot be kept, for want of room or
-    of permission, a warning says so and the scene is in memory only.
+    Processes that request the same scene at the same time build it once. Where it cannot be stored, for lack of space
+    or permission, a warning says so and the scene is in memory only.
     """
     path = folder() / f"{_key(list(identity))}.wiwscene"
     with _turn(path):
@@ -108,7 +108,7 @@ def build_digest() -> str:
 
 
 def limit() -> float:
-    """Return the most bytes that scenes may take on disk.
+    """Return the maximum number of bytes that scenes may take on disk.
 
     Raises:
         ArgumentError: `$WIW_CACHE_GB` is not a number of gigabytes.
@@ -136,7 +136,7 @@ def _keep_scene(scene: _core.scene.Scene, path: Path) -> _core.scene.Scene:
 
 @contextmanager
 def _turn(path: Path) -> Iterator[None]:
-    """Let one process or thread at a time make what belongs at `path`; where nothing can be locked, all at once."""
+    """Let one process or thread at a time create `path`; where nothing can be locked, all at once."""
     name = path.with_suffix(".lock")
     lock = _open_lock(name)
     try:

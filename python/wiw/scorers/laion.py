@@ -2,7 +2,7 @@
 """LAION's improved aesthetic predictor: a small network on the image embeddings of CLIP ViT-L/14.
 
 Source: github.com/christophschuhmann/improved-aesthetic-predictor (Apache-2.0), on openai/clip-vit-large-patch14 (MIT).
-Neither is downloaded by this package: the head lies where the user put it, and CLIP there too or in the hub's cache.
+Neither is downloaded by this package: the head is where the user put it, and CLIP there too or in the hub's cache.
 """
 
 from __future__ import annotations
@@ -45,7 +45,7 @@ class LaionScorer:
         device: of torch; "auto" is the GPU if there is one.
 
     Raises:
-        WeightsError: weights are not there (says where they come from) or belong to another network.
+        WeightsError: weights do not exist (says where to get them) or belong to another network.
         DependencyError: torch or transformers is not installed.
     """
 

@@ -10,8 +10,8 @@ order:
 
     {"path": "/tmp/.../5f3a.png", "scores": {"musiq": 61.5}}
 
-Every line is flushed. What is not an answer belongs on the standard error. It ends with exit code 0 once all paths are
-answered. Nothing of it is imported here, so its licence is its own.
+Every line is flushed. All other output belongs on standard error. It ends with exit code 0 once all paths are answered.
+Nothing of it is imported here, so its licence is its own.
 """
 
 from __future__ import annotations

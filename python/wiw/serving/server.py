@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The server: connections on one side, a queue of rows on the other, the model in a thread of its own."""
+"""The server: connections on one side, a queue of rows on the other, the model in its own thread."""
 
 from __future__ import annotations
 
@@ -46,7 +46,7 @@ AHEAD = 4
 HEARTBEAT, SILENCE, HANDSHAKE = 10.0, 30.0, 10.0
 """Seconds: between pings, without an answer to one until a client counts as gone, and for a client's first message."""
 UNREAD = 30.0
-"""Seconds in which a client takes nothing of what waits for it, until it is sent away."""
+"""Seconds after which a client that receives nothing is disconnected."""
 CLOSING = 1.0
 """Seconds that a client has to end the connection in order."""
 TICK = 0.1
@@ -168,7 +168,7 @@ class Server:
         return sum(outbox.unsent_bytes for outbox in self._outboxes.values())
 
     async def run(self, ready: Callable[[], None] = lambda: None) -> None:
-        """Serve until `end` is called; then finish what it has taken.
+        """Serve until `end` is called; then finish the rows it has accepted.
 
         Raises:
             InfrastructureError: the address cannot be listened at.
@@ -380,7 +380,7 @@ def _welcome(model: WorldModel, in_flight: int) -> Welcome:
 
 
 def _sources(model: WorldModel, fingerprint: str) -> dict[str, Any]:
-    """Return what tells versions of a model apart that declares none: digests of its source files, by name."""
+    """Return an identifier of the version of a model that declares none: digests of its source files, by name."""
     digests = {} if fingerprint else source_digests(model)
     return {"sources": {Path(path).name: digest for path, digest in digests.items()}} if digests else {}
 

@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """A small OpenAI-compatible server of chat completions, with any `Client` behind it.
 
-It speaks log-probabilities, images as data URIs, JSON schemas, choices and usage, as far as `wiw` and its tests ask for
+It speaks log-probabilities, images as data URIs, JSON schemas, choices and usage, as far as `wiw` and its tests use
 them.
 """
 
@@ -25,7 +25,7 @@ from wiw.vlm.messages import Call, Completion, Message, Part
 MOST_BYTES = 256 << 20
 """Maximum size of a request's body in bytes."""
 UNCLEAR = (Error, ValueError, LookupError, TypeError, AttributeError, OverflowError, RecursionError)
-"""What a request that makes no sense raises; anything else is a fault of the model or script behind the server."""
+"""Error for a request that makes no sense; anything else is a fault of the model or script behind the server."""
 
 
 @dataclass(frozen=True)
@@ -102,7 +102,7 @@ class VlmServer:
         return Response(200, make_chat_completion(self.complete(body), self.client.model, number))
 
     def complete(self, body: dict[str, Any]) -> Completion:
-        """Return the completion that a request asks for."""
+        """Return the completion of a request."""
         call = parse_call(body)
         with self._asking:
             (completion,) = self.client.complete([call])
@@ -189,7 +189,7 @@ class _Handler(BaseHTTPRequestHandler):
 
 
 def parse_call(body: Mapping[str, Any]) -> Call:
-    """Return the call that a request asks for.
+    """Return the call of a request.
 
     Raises:
         ArgumentError: an image that is not a data URI, or several completions at once.

@@ -93,7 +93,7 @@ class TabletopTask(ABC):
         """Return an instruction for a target, in one of several wordings."""
 
     def parse_target(self, text: str) -> Any:
-        """Return the target of an instruction: the one colour that it names.
+        """Return the target of an instruction: its only colour word.
 
         Raises:
             ArgumentError: it names none, or several.
@@ -124,8 +124,8 @@ class TabletopTask(ABC):
     def estimate_completion(self, front: NDArray[np.uint8], places: Mapping[str, Pose], target: Any) -> float:
         """Return how far a front view, uint8 [H, W, 3] of any size, shows a target as achieved, from 0 to 1.
 
-        The view may be imagined and blurred; partial progress lies in between. `places` are the objects' poses before
-        the plan whose end the view shows.
+        The view may be imagined and blurred; partial progress is in between. `places` are the objects' poses before the
+        plan whose end the view shows.
         """
 
 

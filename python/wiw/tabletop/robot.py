@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
 """The arm at the table: the project's own Panda, or one described by a URDF file.
 
-What a description leaves open is inferred: two links that slide on the same link are the fingers, and that link is the
-hand; the point between the finger tips is the link whose name says so (`TOOL_WORDS`).
+Whatever a description leaves open is inferred: two links that slide on the same link are the fingers, and that link is
+the hand; the point between the finger tips is the link whose name says so (`TOOL_WORDS`).
 """
 
 from __future__ import annotations

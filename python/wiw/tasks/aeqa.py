@@ -63,7 +63,7 @@ class AEQARules:
 class AEQA(NavigationTask):
     """Answer a question about a home, exploring it as far as needed.
 
-    What is asked, when an episode ends, and what is measured. `NavigationTask` documents the rest of the arguments.
+    Questions, when an episode ends, and metrics. `NavigationTask` documents the rest of the arguments.
 
     Args:
         judge: who marks answers, see `wiw.judging.make_judge`: "rules" marks typed questions by rules and all others
@@ -113,7 +113,7 @@ class AEQA(NavigationTask):
 
     @property
     def decisions(self) -> int:
-        """Decisions that an episode takes if each carries out as much as it may: what progress bars expect."""
+        """Number of decisions of an episode if each executes as much as it may: what progress bars expect."""
         return -(-self.limit // int(self.rules.execute))
 
     @property
@@ -191,8 +191,8 @@ class AEQA(NavigationTask):
     def generate_first(self, count: int) -> list[Episode]:
         """Return questions, from where the answer is not in view.
 
-        Of generated apartments each is asked in two at least, with different answers. A scene from a file stands alone:
-        its questions are unbalanced, and their episodes say so (`info["unbalanced"]`).
+        Of generated apartments each is asked in two at least, with different answers. A scene from a file is used
+        alone: its questions are unbalanced, and their episodes say so (`info["unbalanced"]`).
         """
         scenes = resolve(self.scenes)
         if not self.is_balanced:
@@ -331,7 +331,7 @@ class AEQA(NavigationTask):
 
 
 def read_question(episode: Episode) -> Question:
-    """Return the question of an episode, with all that the agent is not told."""
+    """Return the question of an episode, including everything hidden from the agent."""
     return Question.from_info(episode.info["question"])
 
 

@@ -42,7 +42,7 @@ class Task(ABC):
     sensor_options: tuple[str, ...] = ()
     """Options of `wiw.make` that are the environment's, not the task's."""
     choices: tuple[str, ...] = ()
-    """Labels that answers are chosen from, if the task asks for any."""
+    """Labels that answers are chosen from, if the task requires one."""
     wording: Wording = Wording()
     """The words that reports use for its episodes."""
     tables: TableSpec = TableSpec()

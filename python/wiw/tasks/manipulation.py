@@ -113,7 +113,7 @@ class Manipulation(ManipulationSpec, Task):
 
     @property
     def decisions(self) -> int:
-        """Decisions that an episode may take, where all that is planned for one is carried out."""
+        """Number of decisions of an episode, if each plan is executed in full."""
         execute = self.rules.execute
         return -(-self.rules.actions // (execute if execute > 0 else max(1, self.rules.horizon + execute)))
 
@@ -184,7 +184,7 @@ class Manipulation(ManipulationSpec, Task):
         return float(-len(self.plan_expert(table, bench)) or UNREACHABLE)
 
     def plan_expert(self, table: Table, bench: Workbench) -> NDArray[np.float64]:
-        """Return what is left to do as a bench stands, float64 [K, 7]; nothing where nothing helps."""
+        """Return the remaining poses from a bench's present state, float64 [K, 7]; nothing where nothing helps."""
         kind, setup = table.kind, table.setup
         places = bench.get_poses(setup.objects)
         front = bench.render_view(arm=False)["color"]

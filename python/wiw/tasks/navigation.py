@@ -28,8 +28,8 @@ class NavigationTask(NavigationSpec, Task):
     """Base of the tasks in which an agent walks; a subclass says what its goal is and when it is reached.
 
     Args:
-        scenes: scene spec, e.g. "apartments:test:40", or the path of a mesh or SDF world; None: "apartments:val". Where
-            Habitat's navigation mesh lies beside it ("house.navmesh" for "house.glb"), that one is used.
+        scenes: scene spec, e.g. "apartments:test:40", or the path of a mesh or SDF world; None: "apartments:val". If
+            Habitat's navigation mesh is beside it ("house.navmesh" for "house.glb"), that one is used.
         seed: seed of the generated episodes and of the run.
         preset: "default", "paper", "official", or the path of a YAML file; `rules` overrides it field by field.
         episode_file: a JSON episode file to use instead of generating; habitat-lab's and World-in-World's are read too.

@@ -108,11 +108,11 @@ def find_owner(task: type) -> str:
 def load_rules(cls: type[Rules], task: str, preset: str | Path, overrides: Mapping[str, Any]) -> Rules:
     """Return the rules of a preset, by name or by the path of a YAML file, with `overrides` on top.
 
-    What neither says is the default of `cls`, so that a task of one's own needs no preset: for a task that ships none,
+    Anything that neither sets is the default of `cls`, so a user's task needs no preset: for a task that ships none,
     the default preset stands for these values.
 
     Raises:
-        ArgumentError: no such preset; a key that is not a rule; a value of another type. Names the file or argument.
+        ArgumentError: no such preset; an unknown rule; a value of another type. Names the file or argument.
         FileError: the file cannot be read, or does not hold a mapping.
     """
     values: dict[str, Any] = {}
@@ -137,7 +137,7 @@ def _open_fields(cls: type) -> list[Field[Any]]:
 
 
 def _list_files(task: str, preset: str | Path) -> list[Path]:
-    """Return the files of a preset, what it is based on first."""
+    """Return the files of a preset, those it is based on first."""
     path = _find(task, preset)
     if path is None:
         return []
@@ -191,7 +191,7 @@ def _read_generator_rules(content: Mapping[str, Any], path: Path) -> Mapping[str
 
 
 def _read_options(content: Mapping[str, Any], section: str, path: Path) -> Options:
-    """Return a section with options of parts, from a file of its own where it names one."""
+    """Return a section with options of parts, from a separate file where it names one."""
     options = content.get(section, {})
     if isinstance(options, str):
         path = path.parent / options

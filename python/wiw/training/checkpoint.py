@@ -36,7 +36,7 @@ class ResumableTrainer:
 
 @dataclass(frozen=True)
 class TrainingState:
-    """How far a training has come."""
+    """The state of a training."""
 
     epochs: int
     """Epochs of the whole training."""

@@ -141,7 +141,7 @@ def resolve_train_scenes(scenes: str | PathLike[str] | Sequence[str | PathLike[s
 
     Raises:
         ArgumentError: a scene is of a split that is for evaluation, or two scenes have one name.
-        FileError: there is no such file.
+        FileError: the file does not exist.
     """
     given = [scenes] if isinstance(scenes, str | PathLike) else list(scenes)
     names: dict[str, str] = {}

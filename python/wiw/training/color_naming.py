@@ -27,7 +27,7 @@ def calibrate(views: LabelledViews, seed: int, steps: int = STEPS) -> ColorNamer
     """Train a namer on the pixels of the views' instances.
 
     Raises:
-        ArgumentError: the views show nothing of a known colour.
+        ArgumentError: the views have no object of a known colour.
     """
     if not len(views.pixels):
         raise ArgumentError("expected scenes with objects of known colours, got none; choose others (--scenes)")

@@ -30,7 +30,7 @@ SMALL = 144
 
 @dataclass(frozen=True)
 class DecisionRules:
-    """How decisions are constructed. Lengths in metres.
+    """Rules for constructing decisions. Lengths in metres.
 
     Raises:
         ArgumentError: a number is out of range.
@@ -71,14 +71,14 @@ def collect_decisions(
 
     Args:
         specs: the scenes, such as "apartments:val:20".
-        per_scene: decisions of each; fewer where there is not so much room.
+        per_scene: decisions of each; fewer where there is not enough room.
         seed: with scenes and rules, it determines the decisions.
         rules: see `DecisionRules`.
         progress: called after each scene with its name, and how many of how many are done.
 
     Raises:
         ArgumentError: nowhere is there room, or `per_scene` is below 1.
-        FileError: there is no such scene.
+        FileError: the scene does not exist.
     """
     if per_scene < 1:
         raise ArgumentError(f"decisions: expected per_scene of at least 1, got {per_scene}")
@@ -109,7 +109,7 @@ class _Decision:
 
 
 def _construct(world: World, path: StraightPath, draws: np.random.Generator, rules: DecisionRules) -> _Decision | None:
-    """Return plans and places of a decision towards the end of a path; None if too few ways are free."""
+    """Return plans and places of a decision towards the end of a path; None if too few paths are free."""
     length = draws.uniform(rules.goal_shortest, max(path.length, rules.goal_shortest))
     yaw = path.heading + draws.uniform(0, 2 * np.pi)
     turns = draws.permutation(np.arange(-HEADINGS // 2 + 1, HEADINGS // 2 + 1))

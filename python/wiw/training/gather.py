@@ -93,7 +93,7 @@ def gather_glimpse_sets(
 
     Raises:
         FileError: the folder cannot be written.
-        ArgumentError: the scenes show nothing of `categories`.
+        ArgumentError: the scenes have no object of `categories`.
     """
     make = partial(_build_glimpse_sets, seed=seed, categories=tuple(categories), rules=rules)
     job = Job(f"glimpses in {specs}", GLIMPSE_SET_FIELDS, make, (2, list(categories), seed, asdict(rules)))

@@ -34,7 +34,7 @@ WAY_SHARES = np.array([0.0, 0.4, 0.7, 1.0])
 
 @dataclass(frozen=True)
 class GlimpseSetRules:
-    """How a scene is sampled. Lengths in metres."""
+    """Rules for sampling a scene. Lengths in metres."""
 
     places: int = 8
     targets: int = 5

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Training data of the navigator: places of a scene as seen, and the ways between them.
+"""Training data of the navigator: places of a scene as seen, and the paths between them.
 
 A goal view is a part of the panorama at the goal, so any two places of a scene are an example, at any heading.
 """
@@ -26,7 +26,7 @@ AHEAD = 1.0
 TRIES = 8
 """Candidates for each place near another."""
 DEPTH_ROWS = slice(12, 52)
-"""Rows of a 64-row panorama whose median depth tells how far one sees in a column."""
+"""Rows of a 64-row panorama whose median depth is how far one sees in a column."""
 SIGHT_MARGIN = 0.3
 """Metres in front of a place where what is seen hides it no longer."""
 

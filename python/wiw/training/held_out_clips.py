@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""How near imagined frames are to the true ones of held-out clips, and whether they follow the actions.
+"""Measure how close imagined frames are to the true ones of held-out clips, and whether they follow the actions.
 
 The *control gap* is the error under the actions of another clip less the error under the true ones. Which frames count,
 how they are compared and what is imagined under other actions differs between the kinds of clips: panoramas
@@ -146,7 +146,7 @@ def fit_steps(steps: Sequence[int], actions: int) -> tuple[int, ...]:
     """Return the numbers of actions that clips of so many actions have; the last one in place of larger ones.
 
     Raises:
-        ArgumentError: there are no actions.
+        ArgumentError: clips without actions.
     """
     if actions < 1:
         raise ArgumentError("expected clips of at least 2 frames, got 1")

@@ -45,7 +45,7 @@ COLORLESS = ("mirror", "picture", "photo", "window", "opening", "")
 
 @dataclass(frozen=True)
 class ViewRules:
-    """How a scene is sampled."""
+    """Rules for sampling a scene."""
 
     places: int = 12
     close: float = 0.5

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""How training data is prepared: by how many processes, and where it is cached."""
+"""Options for preparing training data: the number of processes, and the cache."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ ProgressBar = Callable[[Iterable[Any], str, int], Iterable[Any]]
 
 @dataclass(frozen=True, kw_only=True)
 class Preparation:
-    """How training data is prepared.
+    """Options for preparing training data.
 
     Raises:
         ArgumentError: no workers.

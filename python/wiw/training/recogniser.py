@@ -51,12 +51,12 @@ class Recipe:
     width: int = 32
     """Channels of the first layer."""
     sizes: bool = True
-    """Whether the network is told estimates of sizes in metres."""
+    """Whether the network receives estimates of sizes in metres."""
     rate: float = 3e-3
     decay: float = 0.02
     smoothing: float = 0.05
     hard: int = 4
-    """How often sets whose first look is hard count."""
+    """Weight of sets whose first look is hard."""
     alone: float = 0.5
     """Weight of the loss of single glimpses beside that of sets."""
     recolor: float = 0.5
@@ -91,11 +91,11 @@ def make_weights(
         out: file of the weights.
         scenes: training scenes, as in `wiw run --scenes`.
         val: held-out scenes.
-        categories: what is told apart.
+        categories: the categories to distinguish.
         rules: which glimpses are recorded.
         recipe: how to train; its seed is that of the glimpses, too.
         minutes: if given, reduces the number of epochs so that training takes about this long.
-        start: recogniser whose training goes on; None for random weights.
+        start: recogniser to continue training from; None for random weights.
         preparation: how glimpses are recorded and cached.
         on_step: called after each step with its number, the number of all steps and a running mean of the loss.
         bar: shows the progress of recording.
@@ -104,7 +104,7 @@ def make_weights(
         The recogniser in the file, with its card.
 
     Raises:
-        ArgumentError: scenes that are both trained and evaluated on, or show nothing of the categories; a start of
+        ArgumentError: scenes that are both trained and evaluated on, or have no object of the categories; a start of
             other categories or another width.
         FileError: a file cannot be written.
     """

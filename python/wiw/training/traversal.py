@@ -129,7 +129,7 @@ def plan_traversal(
         island: index into `navmesh.islands`.
         key: all randomness derives from it.
         rules: the numbers of the algorithm.
-        max_frames: at most so many frames, if that is less than the rules allow.
+        max_frames: maximum number of frames, if lower than the rules allow.
     """
     waypoints = Waypoints(navmesh, island, core.fold_key([key, 0]), rules)
     north = 2 * np.pi * float(core.uniform(core.fold_key([key, 1]), 1)[0])

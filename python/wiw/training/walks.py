@@ -23,7 +23,7 @@ PROBE_SPACING = 0.1
 
 @dataclass(frozen=True)
 class WalkRules:
-    """How a scene is sampled. Lengths in metres."""
+    """Rules for sampling a scene. Lengths in metres."""
 
     places: int = 24
     """Straight walks in a scene."""

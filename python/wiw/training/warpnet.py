@@ -39,7 +39,7 @@ class Recipe:
     """Hyper-parameters of the training."""
 
     epochs: int = 6
-    """How often each panorama is used as a source, on average."""
+    """Number of times each panorama is used as a source, on average."""
     batch: int = 4
     widths: tuple[int, int, int] = (32, 64, 128)
     """Channels of the U-Nets' levels."""
@@ -244,7 +244,7 @@ def evaluate(
         `paths` places of each scene with 1.6 m free ahead, over whole panoramas, weighted by latitude.
 
     Raises:
-        ArgumentError: there is no such place in the scenes.
+        ArgumentError: the scenes have no such place.
     """
     names = scenes.resolve(specs)
     rows = [

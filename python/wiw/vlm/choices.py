@@ -53,7 +53,7 @@ def read_logprobs(
     """Return the labels' probabilities, which sum to 1, and those that the model gave them; None if none is listed.
 
     Variants of a label ("A", " A", "(A") are one. Of the former, a label that is not listed gets the most that it can
-    have: as much as the least likely listed token, or as what all of these leave over; of the latter, nothing.
+    have: as much as the least likely listed token, or the remaining probability; of the latter, nothing.
     """
     listed = [(token, min(value, 0.0)) for token, value in listed if not math.isnan(value)]
     found = [

@@ -27,7 +27,7 @@ MOST_BYTES = 4 << 20
 MOST_OF_AN_ERROR = 1 << 16
 """Bytes of an error's body that are read."""
 LONGEST_WAIT = 60.0
-"""Seconds that are waited before a request is sent again, however long the server asks for."""
+"""Maximum wait in seconds before a request is sent again, whatever the server demands."""
 REFUSED_LOGPROBS = (
     "; set top_logprobs= to the number of first tokens that the server lists, or to 0 to vote on choices instead"
 )
@@ -47,7 +47,7 @@ class OpenAIClient(Client):
         model: its name there; None means the only one that the server offers.
         dialect: how choices and schemas are sent beside the prompt. "openai": `response_format`; "vllm":
             `structured_outputs` too, for choices; "legacy": `guided_choice` and `guided_json` (vLLM before 0.12).
-        concurrency: most requests at a time.
+        concurrency: maximum number of requests at a time.
         timeout: seconds that one request may take.
         attempts: times that it is sent in all while the server is busy or fails; how long it asks to wait is heeded.
         image_format: "png", or "jpeg" for slow connections.

@@ -81,7 +81,7 @@ class Answer:
 
 @dataclass(frozen=True)
 class Wait:
-    """The row was not taken: ask again in so many seconds."""
+    """The row was not taken: retry after this many seconds."""
 
     id: bytes
     seconds: float

@@ -196,7 +196,7 @@ def _check(name: str, value: str, allowed: Sequence[str]) -> None:
 
 @dataclass(frozen=True)
 class Requirements:
-    """What a world model requires from the machine; `wiw list world-models` shows what is missing."""
+    """Requirements of a world model on the machine; `wiw list world-models` shows what is missing."""
 
     packages: tuple[str, ...] = ()
     """Importable names."""

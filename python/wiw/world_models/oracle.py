@@ -19,13 +19,13 @@ from wiw.world_models.base import SMALLEST_PANORAMA, WorldModel, accepts
 class Oracle(WorldModel):
     """Carry the plan out in a fork of the simulator and return what it truly sees there.
 
-    No model imagines better, so its score is the reference for what imagination is worth to a policy. It is no strict
-    ceiling: a policy may succeed by chance where futures are wrong. It alone is given the simulator.
+    No model imagines better, so its score is the reference for what imagination is worth to a policy. It is not a
+    strict ceiling: a policy may succeed by chance where futures are wrong. It alone is given the simulator.
 
     Args:
         size: height and width of its frames, whoever looks at them; where None, up to 576x1024 as the reviser needs,
             480x480 in front views and before a table.
-        view: "perspective" for front views alone in place of panoramas; before a table there is no other.
+        view: "perspective" for front views alone in place of panoramas; on a table there is no other view.
 
     Raises:
         ArgumentError: no size, or a view that the plans do not lead through.

@@ -27,7 +27,7 @@ def lacks(requires: Requirements) -> list[str]:
 
 
 def is_served(name: str, address: str) -> bool:
-    """Return whether a server answers at an address and serves the model of that name; takes a second at most."""
+    """Return whether the server at an address serves the model of that name; takes a second at most."""
     from wiw.errors import RemoteError
     from wiw.world_models.remote.model import Remote
 

@@ -60,7 +60,7 @@ def export_lerobot(
 
 
 def _count(episodes: Iterable[Episode], data: Sized, progress: Progress | None) -> Iterator[Episode]:
-    """Pass episodes on and tell how many are done."""
+    """Pass episodes on and report how many are done."""
     for done, episode in enumerate(episodes, 1):
         yield episode
         if progress is not None:

@@ -12,7 +12,7 @@ from wiw.datasets.questions.grammar import ACTIVITIES, CAPACITIES, HABITS, TEMPL
 Slots = Mapping[str, str]
 
 MATERIALS = {"wood planks": "wood", "wood parquet": "wood", "textile": "fabric", "enamel": "metal", "plant": ""}
-"""Words for materials that a table tells apart and nobody else does; "" is not an answer."""
+"""Words for materials that a table distinguishes and nobody else does; "" is not an answer."""
 ON_STATES, OPEN_STATES = ("on", "off"), ("open", "closed")
 COUNTED = (
     "chair",
@@ -97,7 +97,7 @@ class Fact:
     color: str = ""
     """Name of that colour."""
     gist: str = ""
-    """The part of the answer that answers are told apart by; the room of a place."""
+    """The part of the answer by which answers are distinguished; the room of a place."""
 
     @property
     def key(self) -> str:
@@ -113,7 +113,7 @@ def are_different(first: Fact, second: Fact, answer_type: str) -> bool:
 
 
 def resemblance(guess: str, fact: Fact, answer_type: str) -> float:
-    """Return about how much a guess is worth, from 0 to 1 for the right answer."""
+    """Return about how close a guess is, from 0 to 1 for the right answer."""
     if guess == fact.answer:
         return 1.0
     if answer_type == "place":

@@ -38,7 +38,7 @@ TWIN_TRIES = 6
 SPARE = 2
 """Questions that a scene may have beyond its share, so that the last pairs of a block can be found."""
 FAMILIES = {"floor_material": "material", "which_room": "where"}
-"""Templates that take one turn with another, which asks for the same."""
+"""Templates that alternate with another one that asks the same."""
 
 Pair = tuple[Answerable, Answerable]
 

@@ -27,7 +27,7 @@ _HUES = (
 )
 _SIZE = (160, 188)
 LEAST_PIXELS = 20
-"""Fewer say nothing of a colour."""
+"""Fewer are not enough to name a colour."""
 
 
 def name_colors(pixels: NDArray[np.uint8]) -> NDArray[np.str_]:

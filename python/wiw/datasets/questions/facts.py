@@ -45,7 +45,7 @@ BROADER = {
 }
 """Categories that a shorter word may mean as well: "the chair" is no one thing beside an office chair."""
 PASSAGES = {"hall": "hallway", "corridor": "hallway"}
-"""Rooms that nobody would tell apart by name."""
+"""Rooms that nobody would distinguish by name."""
 
 
 UNCLEAR = "?"
@@ -224,7 +224,7 @@ class SceneTable:
 
 
 def make_table(scene: Scene, name: str = "") -> SceneTable:
-    """Return the table of a scene, which is empty of rooms where the scene does not tell them.
+    """Return the table of a scene, which has no rooms where the scene does not define them.
 
     Instances of a scan that have no surface are left out.
     """

@@ -203,9 +203,9 @@ def look_around(
     points: NDArray[np.float64] | None = None,
     attributes: Attributes = NO_ATTRIBUTES,
 ) -> Surroundings:
-    """Survey a scene, from places of its own or those of another one like it.
+    """Survey a scene, from its own places or those of a similar one.
 
-    The rooms of a scene that does not tell them are found by what is in them (`mesh_table`); `attributes` says more.
+    The rooms of a scene that does not define any are found by what is in them (`mesh_table`); `attributes` says more.
 
     Raises:
         ArgumentError: no rooms are found; attributes of instances that do not exist.

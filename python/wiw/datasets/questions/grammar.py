@@ -83,7 +83,7 @@ CAPACITIES: Mapping[str, str] = {
     "read by a floor lamp": "floor lamp",
     "look into a mirror": "mirror",
 }
-"""Activities for which each of several people needs a thing of their own."""
+"""Activities for which each of several people needs one thing."""
 
 _RESERVED = "above are around can does home how in is it left many nearer of off on open closed or people right the to"
 _TOKEN = rf"(?!(?:{'|'.join(_RESERVED.split())})\b)[a-z0-9]+"
@@ -113,7 +113,7 @@ _PLURALS = ("objects", "rooms")
 
 @dataclass(frozen=True)
 class Template:
-    """One kind of question. What stands in brackets is left out where its slot is not filled."""
+    """One kind of question. Text in brackets is left out where its slot is not filled."""
 
     name: str
     category: str
@@ -218,7 +218,7 @@ def phrase(template: str, slots: Mapping[str, str]) -> str:
 
 
 def parse(text: str) -> ParsedQuestion | None:
-    """Return template and words of a text, or None if it is none of this language."""
+    """Return template and words of a text, or None if it is not in this language."""
     plain = " ".join(text.lower().split()).rstrip(" ?") + "?"
     for name, template in TEMPLATES.items():
         match = _regex(name).fullmatch(plain)

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The scene table of a scene that tells nothing but names: categories from these, colours from renders, rooms by
+"""The scene table of a scene that gives nothing but names: categories from these, colours from renders, rooms by
 `room_plan`, states and materials from nowhere, and all of it overridden by a file if there is one.
 """
 
@@ -88,7 +88,7 @@ def _read_fields(name: str, fields: Any) -> tuple[tuple[str, str], ...]:
 
 
 def observe_table(world: World, survey: Survey, attributes: Attributes, clear: float) -> SceneTable:
-    """Return the table of a scene as its names and renders tell it.
+    """Return the table of a scene according to its names and renders.
 
     Args:
         world: the scene.

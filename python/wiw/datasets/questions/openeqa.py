@@ -30,7 +30,7 @@ SOURCE = "open-eqa"
 PATH_LENGTHS = "gt_path_length.json"
 """Name of the published file of metres by question id, each the length of a recorded tour of the scene."""
 ENDINGS = (".glb", ".basis.glb", ".gltf", ".obj", ".ply", ".dae")
-"""How a scene's file may end, the first one first."""
+"""Suffixes of a scene's file, in order of preference."""
 NEAR = 0.5
 """Metres from a start to the navigation mesh beyond which it is off it."""
 _PLACES = 64
@@ -122,7 +122,7 @@ def _question(item: Mapping[str, Any]) -> Question:
 
 
 def _type_of(answer: str) -> str:
-    """Return the kind of a free answer, where rules can tell."""
+    """Return the kind of a free answer, where rules can decide it."""
     plain = answer.lower().strip(" .!")
     return "yes_no" if plain in ("yes", "no") else "count" if plain.isdecimal() else "text"
 

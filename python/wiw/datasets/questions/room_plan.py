@@ -1,10 +1,10 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Rooms of a scene that tells none: what walls keep apart, named by the furniture that gives rooms away.
+"""Rooms of a scene that defines none: what walls keep apart, named by the furniture that gives rooms away.
 
 A gap between the ends of two walls in one line, up to a few metres wide, is a doorway. Floor that walls and doorways
 close off is one room if it has signs of one room in it, such as a bed. With signs of several, as in an open plan, it is
-of the room whose sign is clearly nearest on foot. Other floor, and what stands there, is in no room: nobody could say
-in which.
+of the room whose sign is clearly nearest on foot. Other floor, and whatever stands there, is in no room: nobody could
+say in which.
 """
 
 from __future__ import annotations

@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """Presuppositions of a question: that what it speaks of is there, once, and in the room it names.
 
-A map has a thing twice, or two rooms that might be the kitchen; the question knows better. It says nothing of the
+A map has a thing twice, or two rooms that might be the kitchen; the question knows better. It does not reveal the
 answer.
 """
 

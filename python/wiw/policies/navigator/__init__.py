@@ -1,9 +1,9 @@
 # SPDX-License-Identifier: Apache-2.0
 """A policy with a belief: a trained network says of each place, seen or imagined, how far the goal is and where.
 
-What all places say is put together on a map, whose unknown parts count as floor. Plans are routes towards where the
-goal may be, and their worth is how soon they would arrive, on average over that belief. What is imagined changes the
-belief, and with it the worth of all plans.
+The evidence of all places is combined on a map, whose unknown parts count as floor. Plans are routes towards where the
+goal may be, and their worth is how soon they would arrive, on average over that belief. Imagined views change the
+belief, and with it the value of all plans.
 """
 
 from __future__ import annotations
@@ -119,10 +119,10 @@ class Navigator(Policy):
     """Heads for the most probable place of the goal, and sticks to it until a better one is known.
 
     It needs depth, of which its map is made. Without a world model it takes the plan that is worth most by what was
-    really seen. Front views of perspective models count as panoramas of which no more is shown.
+    really seen. Front views of perspective models count as panoramas of which only that part is shown.
 
     Args:
-        weights: a file of `wiw train navigator`; None means those that come with wiw.
+        weights: a file of `wiw train navigator`; None means those shipped with wiw.
         options: see `NavigatorOptions`.
 
     Raises:

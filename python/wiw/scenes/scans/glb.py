@@ -121,7 +121,7 @@ class Glb:
     def _list_roots(self) -> list[int]:
         """Return the nodes that the file's scene begins with; without scenes, those that are nobody's children.
 
-        What a file without scenes shows is left open by glTF; here every part counts once.
+        glTF leaves open what a file without scenes shows; here every part counts once.
         """
         nodes, scenes = self.items("nodes"), self.items("scenes")
         if scenes:

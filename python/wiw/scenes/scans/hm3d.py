@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
 """Habitat-Matterport 3D: `SCAN.basis.glb`, and for scans with labels `SCAN.semantic.glb` and `SCAN.semantic.txt`.
 
-Axis Z is up. The picture of the labels is painted on a mesh of its own: each colour is one object of the table. A line
-of the table is `id,RRGGBB,"category",region`; id 0 is unknown.
+Axis Z is up. The picture of the labels is painted on a separate mesh: each colour is one object of the table. A line of
+the table is `id,RRGGBB,"category",region`; id 0 is unknown.
 """
 
 from __future__ import annotations

@@ -51,7 +51,7 @@ def read_objects(path: Path) -> dict[int, ScanObject]:
     """Read the table of a room; where it has classes alone, each class is one object.
 
     Raises:
-        FileError: it is missing, no JSON, or an entry lacks what it needs or names a class that does not exist.
+        FileError: it is missing or not JSON, or an entry is incomplete or names a class that does not exist.
     """
     text = read_text(require_file(path, "expected Replica's table of objects beside the mesh"))
     try:

@@ -58,7 +58,7 @@ class InstanceTable:
         return len(self.instances)
 
     def number(self, labels: NDArray[np.int64]) -> NDArray[np.uint32]:
-        """Return instance ids uint32 of the dataset's ids, of any shape; unlabelled if there is no such object."""
+        """Return instance ids uint32 of the dataset's ids, of any shape; unlabelled if that object does not exist."""
         table = np.full(max(self.ids, default=0) + 2, self.unlabelled_id, np.uint32)
         for source, instance in self.ids.items():
             table[source] = instance

@@ -106,7 +106,7 @@ def measure(
     """Yield the PSNR in dB of each model's frames, weighted by latitude, in full size and reduced to size `small`.
 
     The control gap is measured on mixed windows, with the places of each replaced by those of another, turns kept: rows
-    whose "control" is "shuffled". Turns are rolls, which show nothing of what a model has learnt.
+    whose "control" is "shuffled". Turns are rolls, which say nothing about what a model has learnt.
 
     Raises:
         ArgumentError: there are no windows.

@@ -134,7 +134,7 @@ class VideoFamily(Family):
 
 
 class NWMFamily(Family):
-    """Navigation World Models, which follows motions between front views by itself."""
+    """Navigation World Models, which is conditioned on motions between front views already."""
 
     world_model = "nwm"
     checkpoint_option = "weights"

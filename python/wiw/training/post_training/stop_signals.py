@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""A checkpoint that is also written when a process is told to stop: batch systems send SIGTERM or SIGUSR1."""
+"""A checkpoint that is also written on a signal to stop: batch systems send SIGTERM or SIGUSR1."""
 
 from __future__ import annotations
 
@@ -61,7 +61,7 @@ class SignalledCheckpoint(Checkpoint):
                 signal.signal(number, handler)
 
     def save_if_due(self, trainer: ResumableTrainer, epochs: int, step: int) -> None:
-        """Write the file if a signal has come or the last write was long enough ago; then stop, if so told.
+        """Write the file if a signal has come or the last write was long enough ago; then stop, if the signal says so.
 
         Raises:
             FileError: it cannot be written.

@@ -87,7 +87,7 @@ def post_train(
         validation: folder of another dataset whose clips it is validated on; what is left out if None. With all of the
             data in training and no other dataset, there is no validation, and the checkpoint has the last weights.
         decisions: file of `wiw collect decisions`, for the rank agreement with the oracle.
-        tracker: "trackio", "wandb" or "tensorboard", told what the log is.
+        tracker: "trackio", "wandb" or "tensorboard", which receives the log.
         cache: folder where encoded clips are kept, for later epochs and other trainings on the same data; none if None.
         seconds: least time between two writes of the state.
         on_step: called after each step with its number, the number of all steps and a running mean of the loss.
@@ -167,11 +167,11 @@ def train_and_validate(
     Args:
         trainer: to be trained.
         imagine: with its networks; None without validation.
-        validation: what it is measured on; None to log alone.
+        validation: the validation set; None to log alone.
         out: of the training; its log is in `OUT.log`, and begins anew where no state is kept.
         save: writes the trainer's weights as a checkpoint, given the folder and what was found.
         state: of the training; written every so often and at signals.
-        tracker: "trackio", "wandb" or "tensorboard", told what the log is.
+        tracker: "trackio", "wandb" or "tensorboard", which receives the log.
         on_step: called after each step with its number, the number of all steps and a running mean of the loss.
         on_validation: called after each validation with the number of steps done and what was found.
 
@@ -225,7 +225,7 @@ def _run_steps(
 
 
 def _open_log(out: Path, tracker: str | None, recipe: ClipRecipe) -> TrainingLog:
-    """Return the log of a training, which a tracker is told as well."""
+    """Return the log of a training, which is also passed to a tracker."""
     folder, told = locate_log(out), tracker if distributed.is_main() else None
     return TrainingLog(folder / LOG, [open_tracker(told, out.name, folder, recipe.describe())] if told else [])
 

@@ -15,11 +15,11 @@ from wiw.training.post_training.trackers import Tracker
 
 
 class TrainingLog:
-    """A file of JSON lines, and whatever trackers are told the same.
+    """A file of JSON lines, and trackers that receive the same values.
 
     Args:
         path: of the file.
-        trackers: told every line's numbers.
+        trackers: receives every line's numbers.
     """
 
     def __init__(self, path: Path, trackers: Sequence[Tracker] = ()) -> None:

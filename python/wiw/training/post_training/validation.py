@@ -145,7 +145,7 @@ def build_validation_set(
 
 
 class ValidatedTrainer(ResumableTrainer):
-    """A trainer that is validated before a step, every so many steps; what it learns does not depend on it.
+    """A trainer that is validated before a step, every so many steps; training does not depend on it.
 
     Validation belongs to the step after it, so that a state written before it resumes with it. The weights, the log
     and the picture of the best are in one folder. With several processes, all imagine the same, with weights that may
@@ -154,12 +154,12 @@ class ValidatedTrainer(ResumableTrainer):
     Args:
         trainer: to be validated.
         imagine: with its networks.
-        validation: what it is measured on; None to log alone.
+        validation: the validation set; None to log alone.
         log: of the training; pictures and the best weights lie beside it.
         save: writes the trainer's weights as a checkpoint, given the folder and what was found; called in all
             processes.
-        between: called between two calls of the model, such as to stop when told to.
-        on_validation: told what was found, in the first process.
+        between: called between two calls of the model, for example to stop on a signal.
+        on_validation: receives the results, in the first process.
     """
 
     def __init__(

@@ -76,7 +76,7 @@ def load_cdit(path: Path) -> CDiT:
 
 
 def save(folder: Path, network: CDiT, codec: Any) -> None:
-    """Write a network and its codec into a folder, which is then a checkpoint of its own."""
+    """Write a network and its codec into a folder, which is then a complete checkpoint."""
     state = {name: value.detach().contiguous().cpu() for name, value in network.state_dict().items()}
     save_file(state, folder / TRAINED)
     codec.save_pretrained(folder / "vae")
@@ -86,7 +86,7 @@ def load_codec(vae: str, revision: str | None) -> Any:
     """Load the image codec from a local folder or the hub.
 
     Raises:
-        WeightsError: nothing there, or not a whole AutoencoderKL.
+        WeightsError: the folder is empty, or the AutoencoderKL is incomplete.
     """
     try:
         codec: Any = AutoencoderKL.from_pretrained(vae, revision=revision)

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What goes over the wire: rows as a model accepts them, and no larger."""
+"""Limits of the connection: rows as a model accepts them, and no larger."""
 
 from __future__ import annotations
 

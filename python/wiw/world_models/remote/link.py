@@ -135,7 +135,7 @@ class Link:
         """Return the answer to a question.
 
         Raises:
-            LateError: it did not come in time.
+            LateError: it did not arrive in time.
             RemoteError: the connection has been lost for too long.
         """
         while True:
@@ -151,7 +151,7 @@ class Link:
                     ) from None
 
     def close(self) -> None:
-        """End the connection and the thread, and tell those who still wait."""
+        """End the connection and the thread, and fail the calls that still wait."""
         self._closed = True
         if self._thread.is_alive():
             self._call_soon(self._loop.stop)

@@ -36,7 +36,7 @@ class Links:
 
         Raises:
             RemoteError: one has not answered in time, or refuses; "model" where one serves another model than the
-                first, or a model without a version, which cannot be told from another.
+                first, or a model without a version, which cannot be distinguished from another.
         """
         give_up = time.monotonic() + seconds
         found = [link.welcome(max(0.0, give_up - time.monotonic())) for link in self._links]
@@ -83,7 +83,7 @@ class Links:
         """Return the numbers of the servers that are connected, as soon as there are any.
 
         Raises:
-            RemoteError: none has come back in time.
+            RemoteError: none has returned in time.
         """
         while True:
             for link in self._links:
@@ -119,7 +119,7 @@ class Links:
 
 
 def _take(left: deque[int], most: int) -> list[int]:
-    """Take up to so many places; several threads may do so at once."""
+    """Take up to this many places; several threads may do so at once."""
     own: list[int] = []
     while len(own) < most:
         try:

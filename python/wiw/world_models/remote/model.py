@@ -33,7 +33,7 @@ PATIENCE, PATIENCE_FOR_JOBS = 15.0, 270.0
 OVERHEAD = 1024
 """Bytes of a message beside its row."""
 MARGIN = 0.05
-"""Share of the caller's patience that is kept for telling it why there is no answer."""
+"""Share of the caller's time limit reserved for reporting why there is no answer."""
 
 
 class Remote(WorldModel):
@@ -41,8 +41,8 @@ class Remote(WorldModel):
 
     Args:
         address: "ws://HOST:PORT", or "wss://..." for a server behind TLS; several with commas between them share the
-            rows of each call, and go on without one that dies. Or a folder in which servers of the same model announce
-            themselves (`wiw serve --announce FOLDER/NAME.json`).
+            rows of each call, and continue without one that dies. Or a folder in which servers of the same model
+            announce themselves (`wiw serve --announce FOLDER/NAME.json`).
         token: the server's; None means that of the environment variable WIW_TOKEN. Announced servers say theirs.
         patience: seconds that the first connection may take; 15 if not given, 270 for servers that are announced.
 

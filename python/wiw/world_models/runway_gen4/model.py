@@ -33,13 +33,13 @@ class RunwayGen4(WorldModel):
     """Runway Gen-4: a clip from the front view and the plan in words, generated on Runway's servers for a fee.
 
     The key is read from the environment, RUNWAYML_API_SECRET. All rows of a call are begun at once and waited for
-    together. A row that the service has confirmed is never begun again: a repeated question goes on waiting for it.
+    together. A row that the service has confirmed is never begun again: a repeated request continues to wait for it.
 
     Args:
         model: "gen4_turbo", or "gen4.5".
         duration: seconds of a clip, 2 to 10; each costs credits.
         size: (height, width) of input and output, square and at most 960x960, which the service makes of it.
-        frames: of a rollout, the observation included: the most actions that a clip is asked to show, and one more.
+        frames: of a rollout, the observation included: the maximum number of actions that a clip is to show, plus one.
         batch: rows that are begun at once.
         budget: credits after which no more tasks are started; None means no limit.
         template, alignment: as of `TextVideoModel`; clips count as having `frames` frames.

@@ -89,7 +89,7 @@ class Tasks:
         raise InfrastructureError(f"RunwayGen4: task {task.id} ended as {task.status}{reason}")
 
     def _ask(self, call: Any, *values: Any, **named: Any) -> Any:
-        """Return an answer of the service; the SDK tries again by itself where that may help.
+        """Return an answer of the service; the SDK itself retries where that may help.
 
         Raises:
             InfrastructureError: it refused, or is out of reach.

@@ -29,7 +29,7 @@ def fetch_video(url: str, size: tuple[int, int]) -> NDArray[np.uint8]:
     """Return all frames of the video at an address, uint8 [T, H, W, 3] in (height, width) `size`.
 
     Raises:
-        InfrastructureError: it cannot be had, is larger than 256 MB, or is not a video.
+        InfrastructureError: it cannot be downloaded, is larger than 256 MB, or is not a video.
     """
     if not url.startswith(("https://", "http://")):
         raise InfrastructureError(f"RunwayGen4: expected the address of a video, got '{url[:80]}'")

@@ -24,8 +24,8 @@ class CosmosPredict2(TextVideoModel):
 
     Args:
         guardrail: whether NVIDIA's filter looks at prompts and frames. It has to be said: the licence of the weights
-            ends for who takes the filter away without one of their own, and the filter is a package
-            (`cosmos_guardrail`) with gated weights and needs of its own.
+            terminates if the filter is removed without a substitute, and the filter is a package (`cosmos_guardrail`)
+            with its own gated weights and requirements.
         fps: frames a second that the clip is made for.
     """
 

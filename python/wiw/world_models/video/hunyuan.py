@@ -30,7 +30,7 @@ class Hunyuan(TextVideoModel):
 
     Args:
         negative_guidance: scale of guidance away from `negative_prompt`, above 1 if there is one: the networks run
-            twice. `guidance` is a number that they are told, and steers away from nothing.
+            twice. `guidance` is a number that they receive, not a contrast with a second prompt.
     """
 
     accepts = accepts(control="text", view="perspective", frames=33, cacheable=True)

@@ -27,7 +27,7 @@ from wiw.world_models.base import Requirements
 ADAPTER = "lora"
 """Name of the LoRA in the pipeline."""
 METADATA = "lora_adapter_metadata"
-"""Where diffusers keeps rank and alpha."""
+"""The place where diffusers keeps rank and alpha."""
 _PREFIX = re.compile(r"^(?:pipe\.(?:dit|transformer)\.|base_model\.model\.|diffusion_model\.)+")
 _OTHER_DENOISER = re.compile(
     r"^(transformer(?:_2)?)\.(?=(?:transformer_)?blocks|single|condition|proj|time|patch|x_|norm)"

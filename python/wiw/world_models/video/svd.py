@@ -18,11 +18,11 @@ HUB = "stabilityai/stable-video-diffusion-img2vid"
 class SVD(VideoModel):
     """Stable Video Diffusion: a clip from the front view; the plan does not control it (Blattmann et al. 2023).
 
-    Frame k of the clip stands for what follows action k.
+    Frame k of the clip is the view after action k.
 
     Args:
         fps: frames a second that the clip is made for.
-        motion: how much moves, from 1 to 255 (`motion_bucket_id`).
+        motion: the amount of motion, from 1 to 255 (`motion_bucket_id`).
         noise: standard deviation of the noise on the observation; more of it, more motion.
     """
 

@@ -35,7 +35,7 @@ class Weights:
 
     folder: Path
     identity: Mapping[str, str]
-    """What tells the weights from others: "commit" on the hub, or "digest" of a folder of the user's own."""
+    """An identifier of the weights: "commit" on the hub, or "digest" of a folder of the user's own."""
 
 
 def fetch_weights(
@@ -46,7 +46,7 @@ def fetch_weights(
     `components` are parts that the folder need not have.
 
     Raises:
-        WeightsError: there is no such folder, repository or revision, or it may not be read.
+        WeightsError: the folder, repository or revision does not exist, or may not be read.
         ArgumentError: a revision of a folder.
     """
     folder = Path(name).expanduser()

@@ -39,7 +39,7 @@ class WarpNet(Trained):
     size; distances and painting are the network's, in a small one.
 
     Args:
-        weights: a file of `wiw train warpnet`; None means those that come with wiw.
+        weights: a file of `wiw train warpnet`; None means those shipped with wiw.
         size: (height, width) of panoramas in and out; 576x1024 if not given. 144x256, all that the matcher reads, takes
             a third of the time. Results differ a little between sizes.
 

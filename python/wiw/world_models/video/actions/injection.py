@@ -39,7 +39,7 @@ class Injection:
             self._vectors = None
 
     def remove(self) -> None:
-        """Take the hooks away; the denoiser is what it was."""
+        """Take the hooks away; the denoiser is unchanged."""
         for handle in self._handles:
             handle.remove()
         self._handles = ()

@@ -27,7 +27,7 @@ if TYPE_CHECKING:
 
 PANORAMA = (576, 1024)
 POSES = {"space": GRIPPER_POSES, "view": "perspective", "null_first": False}
-"""What a model of poses accepts otherwise than one of primitives."""
+"""How the inputs of a model of poses differ from those of a model of primitives."""
 
 
 class ActionConditioned(WorldModel):
@@ -45,7 +45,7 @@ class ActionConditioned(WorldModel):
 
     Raises:
         TypeError: an option that the generator does not have.
-        WeightsError: the checkpoint cannot be had, or belongs to another generator; see also `VideoModel`.
+        WeightsError: the checkpoint cannot be loaded, or belongs to another generator; see also `VideoModel`.
     """
 
     accepts = accepts(control="action", null_first=True, cacheable=True)
