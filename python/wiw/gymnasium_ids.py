@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """`gymnasium.make("wiw/ImageNav-v0", scenes=...)`: the environments in gymnasium's own registry.
 
-`import wiw` does not import gymnasium: where that is not imported yet, the environments are registered once it is.
+`import wiw` does not import gymnasium: if it has not been imported yet, the environments are registered once it is.
 """
 
 from __future__ import annotations

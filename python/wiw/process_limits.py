@@ -53,7 +53,7 @@ def find_memory_limit() -> int:
 def limit_memory() -> int:
     """Let this process take three quarters of the machine's or the container's memory; return that in bytes.
 
-    The kernel counts each process by itself: those that this one starts may take as much each.
+    The kernel counts each process separately: each one that this process starts may take as much again.
     """
     most = find_memory_limit()
     _, hard = resource.getrlimit(resource.RLIMIT_DATA)

@@ -213,7 +213,7 @@ def test_wrapped_policies_draw():
 @pytest.mark.parametrize(
     ("pictures", "wrong"),
     [
-        ([np.zeros((4, 4, 3), np.uint8)], "expected pictures by name, got list"),
+        ([np.zeros((4, 4, 3), np.uint8)], "expected a mapping from names to images, got list"),
         ({"../map": np.zeros((4, 4, 3), np.uint8)}, "expected names of letters, digits and underscores, got '../map'"),
         ({"map": np.zeros((4, 4, 3))}, r"expected 'map' as uint8 \[H, W, 3\], got float64 \[4, 4, 3\]"),
         ({"map": np.zeros((4, 4), np.uint8)}, r"got uint8 \[4, 4\]"),

@@ -311,7 +311,7 @@ def test_reasons_of_a_file_of_ones_own_are_checked(tmp_path: Path) -> None:
     found = find_departures(ImageNav("apartments:val", preset=own), {"arm": AgentRecipe("vlm")})
     assert "radius 1.0 (paper: 0.5): our floor is large" in [str(each) for each in found]
     own.write_text("departures:\n  everyone: {radius: why}\n")
-    with pytest.raises(ArgumentError, match=r"own\.yaml: departures: expected reasons by whom they concern"):
+    with pytest.raises(ArgumentError, match=r"own\.yaml: departures: expected reasons, grouped by whom they concern"):
         ImageNav("apartments:val", preset=own)
     own.write_text("models: [ltx]\n")
     with pytest.raises(ArgumentError, match="models: expected options by name"):

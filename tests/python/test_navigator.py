@@ -433,7 +433,7 @@ def test_what_the_policy_needs_is_asked_for_in_words(situate: Any) -> None:
     policy = tiny_policy()
     situation = situate(policy)
     blind = replace(situation, observation=replace(situation.observation, depth=None))
-    with pytest.raises(ArgumentError, match="navigator makes its map of depth, and the observation has none"):
+    with pytest.raises(ArgumentError, match="navigator builds its map from depth, but the observation has none"):
         policy.observe([blind])
     with pytest.raises(ArgumentError, match="expected a goal image, got none in task ar"):
         policy.begin(Goal("ar", choices=("chair",)), Key(0, 0))

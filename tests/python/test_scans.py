@@ -182,8 +182,8 @@ class TestMatterport:
         [
             (lambda text: text.replace("ASCII 1.1", "ASCII 2.0"), "expected 'ASCII 1.1' in the first line"),
             (lambda text: text.replace("\nO 6", "\nX 6"), "has 6 objects, but its header says 7"),
-            (lambda text: text.replace("R 1 0", "R 3 0"), "line .*: no record 'O' of a house .*region 1 is not there"),
-            (lambda text: text.replace("C 4 104", "C x 104"), "line .*: no record 'C' of a house"),
+            (lambda text: text.replace("R 1 0", "R 3 0"), "line .*: not a house record 'O' .*region 1 does not exist"),
+            (lambda text: text.replace("C 4 104", "C x 104"), "line .*: not a house record 'C'"),
             (lambda text: text.replace("O 2 0 2 1.2", "O 2 0 2 nan"), "line .*: no record 'O' .*not finite"),
             (lambda text: "ASCII 1.1\n", "has no header record"),
         ],
@@ -345,7 +345,7 @@ class TestReplica:
     @pytest.mark.parametrize(
         ("text", "message"),
         [
-            ("{", "no table of Replica's"),
+            ("{", "not a Replica table"),
             ('{"classes": [{"id": 1, "name": "a"}], "objects": [{"id": 3, "class_id": 7}]}', "no table .*KeyError: 7"),
             ('{"objects": []}', "no table .*KeyError: 'classes'"),
         ],
@@ -467,7 +467,7 @@ class TestSceneDataset:
         ("change", "message"),
         [
             ({"stage_instance": {}}, "cannot be read as a scene instance .*KeyError: 'template_name'"),
-            ({"object_instances": [{"template_name": "chair", "rotation": [0, 0, 0, 0]}]}, "is no quaternion"),
+            ({"object_instances": [{"template_name": "chair", "rotation": [0, 0, 0, 0]}]}, "is not a quaternion"),
             ({"object_instances": [{"template_name": "chair", "translation": [1, 2]}]}, "three finite numbers"),
             ({"object_instances": 3}, "cannot be read as a scene instance"),
         ],
@@ -503,10 +503,10 @@ class TestSceneDataset:
         for text, message in (
             (whole[:80], "ParseError"),
             (whole.replace('xyz="0 0 1"', 'xyz="0 0 x"'), "ValueError"),
-            (whole.replace('parent link="body"', 'parent link="drawer"'), "circle"),
+            (whole.replace('parent link="body"', 'parent link="drawer"'), "cycle"),
         ):
             urdf.write_text(text)
-            with pytest.raises(FileError, match=rf"chest\.urdf: no URDF .*{message}"):
+            with pytest.raises(FileError, match=rf"chest\.urdf: not a readable URDF .*{message}"):
                 load(path)
 
 
@@ -518,8 +518,8 @@ def test_verify_says_what_is_wrong(tmp_path: Path, capsys: pytest.CaptureFixture
     damaged.with_name("info_semantic.json").write_text("{")
     assert main(["scenes", "verify", str(tmp_path / "all")]) == 1
     out = capsys.readouterr().out
-    assert "3 scans, 2 with something wrong" in out and "info_semantic.json: no table of Replica's" in out
-    assert "1 of 6 objects lie over 0.5 m from their boxes in the house file: 2" in out
+    assert "3 scans, 2 with something wrong" in out and "info_semantic.json: not a Replica table" in out
+    assert "1 of 6 objects are over 0.5 m from their boxes in the house file: 2" in out
     row = next(line.split() for line in out.splitlines() if line.startswith("whole"))
     assert row[2:7] == ["2", "0.0", "6", "6", "2"]
     assert main(["scenes", "verify", f"mp3d:{tmp_path / 'all' / 'whole'}"]) == 0
@@ -628,5 +628,5 @@ def test_nodes_of_a_labelled_mesh_without_scenes_count_once() -> None:
         assert {mesh: own[:3, 3].tolist() for mesh, own in placed.items()} == {0: [1, 2, 3], 1: [1, 2, 7], 2: [0, 0, 0]}
         assert len(Glb(Path("x.glb"), document, b"").node_transforms) == 3
     assert Glb(Path("x.glb"), {"nodes": nodes, "scenes": [{"name": "empty"}]}, b"").node_transforms == []
-    with pytest.raises(ValueError, match="circle"):
+    with pytest.raises(ValueError, match="cycle"):
         list(Glb(Path("x.glb"), {"nodes": [{"children": [1]}, {"children": [0]}]}, b"").node_transforms)

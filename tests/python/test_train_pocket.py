@@ -244,7 +244,7 @@ def test_the_command_trains_measures_and_is_run(
 @pytest.mark.parametrize(
     ("options", "said"),
     [
-        ([], "pocket trains on a dataset; give a folder of `wiw collect navigation` by --data"),
+        ([], "pocket trains on a dataset; give a folder of `wiw collect navigation` with --data"),
         (["--data", "nowhere"], "nowhere"),
         (["--data", "d", "--option", "lr=1"], "recipe: unknown name 'lr'"),
     ],

@@ -301,7 +301,7 @@ def test_the_command_refuses_what_cannot_end_well(
     tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     assert main(["train", "recogniser", "--out", str(tmp_path / "no" / "x")]) == 2
-    assert "folder that exists" in capsys.readouterr().err
+    assert "existing folder" in capsys.readouterr().err
     overlapping = ["--scenes", "apartments:train:3", "--val", "apartments:train:1", "--out", str(tmp_path / "x")]
     assert main(["train", "recogniser", *overlapping]) == 2
     assert "apartments:train/0 in both" in capsys.readouterr().err

@@ -45,7 +45,7 @@ def test_a_run_comes_out_again_as_it_was_recorded(run, capsys):
     chosen = [tuple(c.episode for c in wiw.verify(run, 2, seed).checks) for seed in (0, 0, 1, 2, 3)]
     assert chosen[0] == chosen[1] and len(set(chosen)) > 1
     assert main(["verify", str(run), "--episodes", "2"]) == 0
-    assert "all as recorded" in capsys.readouterr().out and store_path(run).read_bytes() == before
+    assert "everything is as recorded" in capsys.readouterr().out and store_path(run).read_bytes() == before
 
 
 def test_with_a_world_model_pictures_and_several_arms(two_rooms, tmp_path):

@@ -309,7 +309,7 @@ def test_one_name_for_primitives_and_poses() -> None:
     assert posing.policy.describe()["policy"] == "ArmVLM" and "tracker" not in posing.policy.describe()
     for policy, name in (("heuristic", "Heuristic"), (agent.policy, "VLM")):
         with pytest.raises(
-            ArgumentError, match=f"plans in poses of a gripper, but policy {name} makes them of discrete primitives"
+            ArgumentError, match=f"plans in poses of a gripper, but policy {name} makes plans of discrete primitives"
         ):
             agent_for(Manipulation(), wiw.Agent(policy))
     with pytest.raises(ArgumentError, match="among ar, imagenav, got 'manipulation'"):

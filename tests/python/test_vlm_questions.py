@@ -489,7 +489,7 @@ def test_options_out_of_range() -> None:
             make_policy(None, **wrong)
     with pytest.raises(ArgumentError, match="instance ids"):
         make_vlm(task="aeqa", vlm="mock", perception=wiw.registry.LABELLERS.make("oracle", instances=[]))
-    with pytest.raises(ArgumentError, match="make it with task='aeqa'"):
+    with pytest.raises(ArgumentError, match="create it with task='aeqa'"):
         make_vlm(vlm="mock").begin(wiw.types.Goal("aeqa", text="Why?", question=True), Key(0, 0))
     with pytest.raises(ArgumentError, match="imagined places, which have no depth"):
         wiw.Agent(make_policy(None), "copy", depth=2)

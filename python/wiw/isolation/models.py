@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
-"""World models of one's own, each in a process of its own.
+"""World models of one's own, each in a separate process.
 
-`find_isolated_model` returns a class that stands for the one behind a name: it tells the same about itself, and an
+`find_isolated_model` returns a class that stands for the one behind a name: it describes itself in the same way, and an
 instance of it passes each rollout on to the instance in its process. Nothing of the model's code is imported here.
 """
 
@@ -59,7 +59,7 @@ def find_isolated_model(name: str) -> type[IsolatedModel]:
     """Return the class that stands for the world model of a name, such as "model.py:MyModel".
 
     Raises:
-        RegistryError: it cannot be imported, which is tried in a process of its own.
+        RegistryError: it cannot be imported, which is tried in a separate process.
     """
     return _make_class(name, read_file_state(name))
 
@@ -85,7 +85,7 @@ def _make_class(name: str, state: tuple[str, int, int] | None) -> type[IsolatedM
 
 
 class IsolatedModel(Isolated, WorldModel):
-    """Stands for a world model in a process of its own.
+    """Stands for a world model in a separate process.
 
     Args:
         isolate: False makes the model in this process instead, and returns it itself.
@@ -96,7 +96,7 @@ class IsolatedModel(Isolated, WorldModel):
     Raises:
         ConstructionError: the constructor raised, did not return in time, or ended its process; and errors of wiw that
             it raised.
-        ArgumentError: the model asks for the simulator.
+        ArgumentError: the model requires the simulator.
     """
 
     def __new__(cls, isolate: bool = True, memory_gb: float | None = None, **options: Any) -> Any:
@@ -110,8 +110,8 @@ class IsolatedModel(Isolated, WorldModel):
         self._accepts = parse_declaration(self._begin())
         if "simulator" in self._accepts.needs:
             raise ArgumentError(
-                f"world model '{self.source.name}' needs the simulator, which only the oracle is handed; to study a "
-                "privileged model of your own, give it isolate=false"
+                f"world model '{self.source.name}' needs the simulator, which only the oracle is given; to study your "
+                "own privileged model, give it isolate=false"
             )
 
     def __reduce__(self) -> Any:
@@ -188,7 +188,7 @@ def _make_again(name: str, options: Mapping[str, Any]) -> Any:
 
 
 def load_model(host: Host, name: str) -> dict[str, Any]:
-    """Import the class or factory behind a name; return what it tells before it is called."""
+    """Import the class or factory behind a name; return its description, which is available before any call."""
     host.thing = thing = WORLD_MODELS.find_here(name)
     host.make = partial(WORLD_MODELS.make_here, name)
     declared, requires = find_accepts(thing), getattr(thing, "requires", Requirements())
@@ -224,7 +224,7 @@ def fingerprint_model(host: Host) -> str:
 def roll_out(
     host: Host, observations: Conditioning, controls: Sequence[Control], seeds: NDArray[np.uint64], seconds: float
 ) -> dict[str, float]:
-    """Write the model's frames into the memory of the answer; return what it has used up so far."""
+    """Write the model's frames into the memory of the answer; return what it has consumed so far."""
     with answer_deadline(seconds):
         frames = host.made.rollout(observations, controls, seeds)
     require_frames(host.made, frames, observations, controls)

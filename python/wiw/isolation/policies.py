@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Policies of one's own, each in a process of its own, by the name "isolated:policy.py:MyPolicy".
+"""Policies of one's own, each in a separate process, by the name "isolated:policy.py:MyPolicy".
 
 The memories of episodes stay in that process; the loop holds handles of them.
 """
@@ -34,7 +34,7 @@ def find_isolated_policy(name: str) -> type[IsolatedPolicy]:
     """Return the class that stands for the policy of a name, such as "policy.py:MyPolicy".
 
     Raises:
-        RegistryError: it cannot be imported, which is tried in a process of its own; or it ships with wiw.
+        RegistryError: it cannot be imported, which is tried in a separate process; or it ships with wiw.
     """
     if not POLICIES.is_foreign(name):
         raise RegistryError(f"isolated: expected a policy of your own, as isolated:path.py:Class, got '{name}'")
@@ -57,14 +57,14 @@ def _make_class(name: str, state: tuple[str, int, int] | None) -> type[IsolatedP
 
 
 class _MemoryHandle:
-    """Stands for the memory of an episode that lies in the policy's process."""
+    """Handle of an episode's memory, which stays in the policy's process."""
 
     def __init__(self, number: int) -> None:
         self.number = number
 
 
 class IsolatedPolicy(Isolated, Policy):
-    """Stands for a policy in a process of its own.
+    """Stands for a policy in a separate process.
 
     A call that fails or is late loses all memories: its episodes end with errors, or begin anew.
 
@@ -228,7 +228,7 @@ def _read_answer(packed: Any) -> Answer | TextAnswer | None:
 
 
 def load_policy(host: Host, name: str) -> dict[str, Any]:
-    """Import the class or factory behind a name; return what it tells before it is called."""
+    """Import the class or factory behind a name; return its description, which is available before any call."""
     host.thing = POLICIES.find_here(name)
     host.make = partial(POLICIES.make_here, name)
     return {**describe_class(host.thing), **_declare(host.thing)}
@@ -289,13 +289,13 @@ def extend(host: Host, situations: Sequence[Situation], candidates: int, horizon
 
 def score(host: Host, situations: Sequence[Situation], proposals: Any, rollouts: Any) -> Any:
     """Return the policy's scores."""
-    return [_pack_array(each) for each in host.made.score(_show_memories(host, situations), proposals, rollouts)]
+    return [_pack_values(each) for each in host.made.score(_show_memories(host, situations), proposals, rollouts)]
 
 
 def revise(host: Host, situation: Situation, proposals: Any, scores: Any) -> Any:
     """Return the plan that the policy decides on, and its number."""
     actions, chosen = host.made.revise(_show_memories(host, [situation])[0], proposals, scores)
-    return _pack_array(actions), None if chosen is None else int(chosen)
+    return _pack_values(actions), None if chosen is None else int(chosen)
 
 
 def answer(host: Host, situations: Sequence[Situation], proposals: Any, rollouts: Any) -> Any:
@@ -306,7 +306,7 @@ def answer(host: Host, situations: Sequence[Situation], proposals: Any, rollouts
 def draw(host: Host, situation: Situation, decision: Decision, north: float) -> Any:
     """Return the policy's pictures."""
     found = host.made.draw(_show_memories(host, [situation])[0], decision, north)
-    return {name: _pack_array(picture) for name, picture in found.items()}
+    return {name: _pack_values(picture) for name, picture in found.items()}
 
 
 def list_exchanges(host: Host, key: Key) -> str:
@@ -317,17 +317,17 @@ def list_exchanges(host: Host, key: Key) -> str:
 def _show_memories(host: Host, situations: Sequence[Situation]) -> list[Situation]:
     missing = [each.memory for each in situations if each.memory not in host.memories]
     if missing:
-        raise RuntimeError("the policy's process has ended since, and with it the memory of this episode")
+        raise RuntimeError("the policy's process has ended, and its memory of this episode is lost")
     return [replace(each, memory=host.memories[each.memory]) for each in situations]
 
 
 def _pack_plans(plans: Any) -> Any:
     if not isinstance(plans, Sequence) or not all(isinstance(each, Proposal) for own in plans for each in own):
         raise ContractError(f"propose: expected a list of wiw.types.Proposal for each episode, got {plans!r:.200}")
-    return [[(_pack_array(each.actions), float(each.prior), each.note, each.text) for each in own] for own in plans]
+    return [[(_pack_values(each.actions), float(each.prior), each.note, each.text) for each in own] for own in plans]
 
 
-def _pack_array(array: Any) -> Any:
+def _pack_values(array: Any) -> Any:
     return pack_array(np.asarray(array))
 
 
@@ -336,5 +336,5 @@ def _pack_answer(believed: Answer | TextAnswer | None) -> Any:
         return None
     if isinstance(believed, TextAnswer):
         return {"text": believed.text, "confidence": float(believed.confidence), "final": bool(believed.final)}
-    raw = None if believed.raw is None else _pack_array(believed.raw)
-    return {"choices": list(believed.choices), "probabilities": _pack_array(believed.probabilities), "raw": raw}
+    raw = None if believed.raw is None else _pack_values(believed.raw)
+    return {"choices": list(believed.choices), "probabilities": _pack_values(believed.probabilities), "raw": raw}

@@ -178,7 +178,7 @@ class ChildProcess:
         try:
             reply = msgpack.unpackb(data, strict_map_key=False)
         except Exception as error:
-            raise OSError(f"no msgpack: {error}") from None
+            raise OSError(f"not valid msgpack: {error}") from None
         if not isinstance(reply, dict):
             raise OSError("expected a map")
         return reply
@@ -205,8 +205,8 @@ class ChildProcess:
             if (taken := _read_own_memory(self._process.pid)) > self._most:
                 self.kill()
                 raise EndedError(
-                    f"its process took {taken / 1e9:.1f} GB of memory, more than {self._most / 1e9:.1f} (memory_gb), "
-                    "and was killed"
+                    f"its process took {taken / 1e9:.1f} GB of memory, more than the limit of {self._most / 1e9:.1f} "
+                    "(memory_gb), and was killed"
                 )
 
     def _describe_end(self) -> str:
@@ -219,11 +219,11 @@ class ChildProcess:
             code = None
         self.kill()
         if code is None:
-            return "its process closed its connection, or sent what is no reply"
+            return "its process closed its connection, or sent something that is not a reply"
         if code >= 0:
             return f"its process ended with exit code {code}"
         name = signal.Signals(-code).name
-        return f"its process ended with {name}" + (", perhaps for lack of memory" if name == "SIGKILL" else "")
+        return f"its process ended with {name}" + (", perhaps out of memory" if name == "SIGKILL" else "")
 
 
 def _read_own_memory(process: int) -> int:
@@ -242,7 +242,7 @@ def _starter() -> ThreadPoolExecutor:
 
 
 def _open(command: list[str], descriptor: int) -> subprocess.Popen[bytes]:
-    """Start a child in a process group of its own, without input; what it prints goes to standard error."""
+    """Start a child in its own process group, without input; its output goes to standard error."""
     return subprocess.Popen(
         command,
         stdin=subprocess.DEVNULL,
@@ -274,7 +274,7 @@ def _take_out(buffer: pickle.PickleBuffer, arrays: list[NDArray[np.uint8]]) -> b
 
 
 def _build_error(message: Any) -> Exception:
-    """Return the exception that a child reports: one of wiw's own, or what stands for somebody else's."""
+    """Return the exception that a child has reported: one of wiw's own, or a substitute for a foreign one."""
     message = message if isinstance(message, dict) else {}
     text = str(message.get("text", ""))
     name, kind = str(message.get("type", "")), message.get("kind")

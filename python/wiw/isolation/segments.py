@@ -36,14 +36,18 @@ class SharedSegment:
         try:
             self.descriptor = os.memfd_create("wiw", os.MFD_CLOEXEC | os.MFD_ALLOW_SEALING)
         except OSError as error:
-            raise InfrastructureError(f"no descriptor for memory to share with a model's process: {error}") from error
+            raise InfrastructureError(
+                f"cannot create a descriptor for memory shared with a model's process: {error}"
+            ) from error
         try:
             os.posix_fallocate(self.descriptor, 0, size)  # now, with an error: later it would be a signal
             fcntl.fcntl(self.descriptor, fcntl.F_ADD_SEALS, SEALS)
             self._memory = mmap.mmap(self.descriptor, size)
         except OSError as error:
             os.close(self.descriptor)
-            raise InfrastructureError(f"no memory to share with a model's process ({size} bytes): {error}") from error
+            raise InfrastructureError(
+                f"cannot allocate memory shared with a model's process ({size} bytes): {error}"
+            ) from error
         self._close = weakref.finalize(self, os.close, self.descriptor)
         self.leased = False
 

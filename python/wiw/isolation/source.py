@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Code of somebody else's, imported in processes of its own: what it says of its class, and processes to make it in."""
+"""A user's code, imported in separate processes: the description of its class, and processes to build it in."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ _SOURCES: weakref.WeakSet[Source] = weakref.WeakSet()
 
 
 def end_idle_processes() -> None:
-    """End the processes that have only told what their code says of itself, where other processes will run it."""
+    """End the processes that have only described their code, where other processes will run it."""
     for source in list(_SOURCES):
         source.end_idle()
 
@@ -67,12 +67,12 @@ class Source:
 
         Raises:
             RegistryError: it cannot be imported.
-            InfrastructureError: it is not what it was when it was imported first.
+            InfrastructureError: it has changed since it was first imported.
         """
         found = self._import(process)
         names = ("module", "name")  # a module's has the state of its file
         if any(found[name] != self.description[name] for name in names):
-            raise InfrastructureError(f"{self.kind} '{self.name}' has changed since it was loaded; begin a new run")
+            raise InfrastructureError(f"{self.kind} '{self.name}' has changed since it was loaded; start a new run")
 
     def _import(self, process: ChildProcess) -> dict[str, Any]:
         """Import the code in a process; return what it says of itself."""
@@ -84,7 +84,7 @@ class Source:
 
 
 class Isolated:
-    """Base of what stands for a part in a process of its own; where that has ended, another one is begun.
+    """Base of what stands for a part in a separate process; if that has ended, another one is started.
 
     Args:
         memory_gb: most gigabytes of memory that a process may take, without those that it starts; three quarters of
@@ -137,13 +137,13 @@ class Isolated:
         self._spent_before += self._spent
         self._spent = Counter()
         process = self.source.take_process(self._memory_gb)
-        cannot = f"{self.source.kind} '{self.source.name}' cannot be made"
+        cannot = f"{self.source.kind} '{self.source.name}' cannot be built"
         try:
             answer = process.call(function, *arguments, seconds=seconds)[0]
         except LateError as error:
             raise ConstructionError(
-                f"{cannot}: its constructor did not return within {seconds:g} s (deadline). Does it wait for a "
-                "download, a lock, a server or a prompt? If it is only slow, give a longer deadline",
+                f"{cannot}: its constructor did not return within {seconds:g} s (deadline). Is it waiting for a "
+                "download, a lock, a server or a prompt? If it is just slow, give a longer deadline",
                 "deadline",
             ) from error
         except (EndedError, ExitError) as error:
@@ -157,7 +157,7 @@ class Isolated:
 
 
 def read_file_state(name: str) -> tuple[str, int, int] | None:
-    """Return what tells versions of the file of "path.py:Class" apart; None for a name without a file."""
+    """Return an identifier of the version of the file in "path.py:Class"; None for a name without a file."""
     path = Path(name.rpartition(":")[0]).expanduser()
     if path.suffix != ".py" or not path.is_file():
         return None
@@ -166,7 +166,7 @@ def read_file_state(name: str) -> tuple[str, int, int] | None:
 
 
 def describe_class(thing: Any) -> dict[str, Any]:
-    """Return what a class or factory tells of itself before it is called."""
+    """Return the description of a class or factory, which is available before it is called."""
     makes = inspect.isclass(thing) or inspect.isroutine(thing) or isinstance(thing, partial)
     parameters = inspect.signature(thing).parameters.values() if makes else ()
     return {
@@ -210,10 +210,10 @@ def build_signature(parameters: Sequence[Mapping[str, Any]], own: Mapping[str, t
 def _read_default(packed: Any) -> Any:
     if packed is None:
         return inspect.Parameter.empty
-    return _Hidden(packed["repr"]) if "repr" in packed else packed["value"]
+    return _HiddenDefault(packed["repr"]) if "repr" in packed else packed["value"]
 
 
-class _Hidden:
+class _HiddenDefault:
     """A default value that the class keeps to itself."""
 
     def __init__(self, text: str) -> None:

@@ -43,7 +43,7 @@ class LanguageModelJudge(Judge):
         prompts: folder with a template `judge.j2` that replaces the shipped one; see `JudgePrompt`.
         temperature: of the sampling.
         seed: of the sampling; it is sent as it is.
-        max_tokens: most tokens of a reply.
+        max_tokens: maximum number of tokens of a reply.
         cache: where replies are kept, so that none is paid for twice: "auto" (`~/.cache/wiw/replies`), a folder, "off".
         client: further options of the client, such as `dialect` and `concurrency`.
 
@@ -158,7 +158,7 @@ def make_schema() -> type[BaseModel]:
 
 
 def _refuse_booleans(value: Any) -> Any:
-    """Return a value that is no boolean; true equals 1 and would pass for it."""
+    """Return a value that is not a boolean; true equals 1 and would pass for it."""
     if isinstance(value, bool):
         raise ValueError("expected a number")
     return value

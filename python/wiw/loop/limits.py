@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Limits of a world model's calls and of a rollout cache unless the user says otherwise."""
+"""Default limits of a world model's calls and of a rollout cache."""
 
 DEADLINE = 300.0
-"""Seconds a call may take: room for a first call that loads and compiles."""
+"""Default time limit of a call in seconds: enough for a first call that loads and compiles."""
 BUDGET_GB = 20.0
-"""Most gigabytes of a rollout cache; a panorama takes 1.8 MB, a front view 0.7 MB."""
+"""Default size limit of a rollout cache in gigabytes; a panorama takes 1.8 MB, a front view 0.7 MB."""

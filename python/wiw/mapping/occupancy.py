@@ -33,7 +33,7 @@ STRIDE = 2
 MARGIN = 8
 """Cells around what is known by which the map grows."""
 LEAST_UNKNOWN = 8
-"""Unknown parts of fewer cells, among known ones, are no frontier's concern."""
+"""Unknown parts of fewer cells among known ones do not make a frontier."""
 LEAST_FRONTIER = 3
 """Cells that a frontier has at least."""
 CEILING_BAND = (0.35, 0.08)

@@ -107,7 +107,7 @@ def _wrap_model(
     if model is None:
         for name in ("placebo", "error"):
             if (given := getattr(experiment, name)) is not None:
-                raise ArgumentError(f"{name}='{given}' needs a world model, and this agent has none")
+                raise ArgumentError(f"{name}='{given}' needs a world model, but this agent has none")
         return None
     imaginer = _make_imaginer(model, experiment.error, limits)
     if experiment.semantics is not None:
@@ -147,7 +147,7 @@ def require_placebo(placebo: str, space: str, episodes: int) -> None:
         raise ArgumentError(NO_POSES)
     if placebo == "swapped" and episodes < 2:
         raise ArgumentError(
-            f"placebo-swapped shows the model another episode: expected at least 2 episodes, got {episodes}"
+            f"placebo-swapped shows the model another episode, so it needs at least 2 episodes; got {episodes}"
         )
 
 

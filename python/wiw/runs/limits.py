@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Limits that every agent of a run is built with; none of them changes an agent's decisions."""
+"""Limits shared by all agents of a run; none of them changes an agent's decisions."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from wiw.errors import ArgumentError
 from wiw.loop.limits import BUDGET_GB, DEADLINE
 
 NO_DEADLINE = 1e12
-"""Seconds that stand for no deadline where a number has to be written down."""
+"""Seconds that stand for no deadline where a number must be stored."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -25,21 +25,21 @@ class Limits:
     """
 
     deadline: Annotated[float, arg(metavar="SECONDS")] = DEADLINE
-    """Most seconds for a call of the world model; it is asked three times before the episode is recorded as an
+    """Time limit in seconds for a call to the world model. After three attempts the episode is recorded as an
     infrastructure error, which is excluded from scores."""
     cache: Annotated[str | Path, arg(metavar="auto|off|DIR")] = "auto"
-    """Where rollouts are cached, so that no question is put to a model twice: auto for models that declare themselves
-    cacheable, in ~/.cache/wiw/rollouts; a folder for every model; or off."""
+    """Where rollouts are cached, so that a model never computes the same one twice: auto (in ~/.cache/wiw/rollouts, for
+    models that declare themselves cacheable), a folder (for every model), or off."""
     cache_gb: Annotated[float, arg(metavar="N")] = BUDGET_GB
-    """Most gigabytes of that folder; the least recently used rollouts go first."""
+    """Maximum size of that folder in gigabytes; the least recently used rollouts are dropped first."""
     fidelity: bool = False
-    """Whether every imagined plan is also replayed in the simulator, to measure how true imagination was. Changes no
+    """Whether to replay every imagined plan in the simulator, to measure how faithful imagination is. Changes no
     decision, but takes about as long as the oracle."""
     fidelity_share: Annotated[float, arg(metavar="SHARE")] = 1.0
-    """Share of the decisions that fidelity is measured at, drawn by their keys."""
+    """Share of the decisions, sampled by their keys, at which fidelity is measured."""
     lpips: Annotated[str | Path | None, arg(metavar="auto|DIR")] = None
-    """Folder with the weights of LPIPS, to measure fidelity by it as well (auto: ~/.cache/wiw/weights). Where they are
-    not there, it says which files are needed."""
+    """Folder with the weights of LPIPS, to measure fidelity with it as well (auto: ~/.cache/wiw/weights). If they are
+    missing, the error says which files are needed."""
 
     def __post_init__(self) -> None:
         for name in ("deadline", "cache_gb"):
@@ -54,7 +54,7 @@ class Limits:
         return self.fidelity or self.lpips is not None
 
     def to_json(self) -> dict[str, Any]:
-        """Return the limits for the run store, the same in any folder; `Limits(**...)` is the way back."""
+        """Return the limits for the run store, independent of the working directory; `Limits(**...)` is the inverse."""
         own = {name: getattr(self, name) for name in Limits.__dataclass_fields__}
         own["deadline"] = min(self.deadline, NO_DEADLINE)
         own["cache"], own["lpips"] = _make_absolute(self.cache), _make_absolute(self.lpips)
@@ -62,7 +62,7 @@ class Limits:
 
 
 def _make_absolute(folder: str | Path | None) -> str | None:
-    """Return a folder so that it means the same anywhere, and words that stand for one as they are."""
+    """Return a folder as an absolute path, and words that stand for a folder unchanged."""
     if folder is None or str(folder) in ("auto", "off"):
         return None if folder is None else str(folder)
     return str(Path(folder).expanduser().resolve())

@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Scenes: meshes, Gazebo worlds and real scans from files.
+"""Scenes: generated apartments, and meshes, Gazebo worlds and real scans from files.
 
-World frame: metres, Y up, right-handed. See `Scene` for what a scene tells about itself.
+World frame: metres, Y up, right-handed. See `Scene` for a scene's attributes.
 """
 
 from wiw import _core

@@ -25,10 +25,10 @@ _log = logging.getLogger("wiw.scenes")
 def apartment(seed: int, split: str = "val", cache: bool = True, *, edits: Sequence[str] = ()) -> Scene:
     """Generate a furnished apartment, the same for the same seed and split; splits share neither layouts nor palettes.
 
-    With `cache` it is made once, in seconds, and then mapped from disk like imported scenes, until the compiled core
-    changes. An edit changes one thing and leaves all else as it is, with light baked for the edited apartment:
-    "color:sofa_1=blue", "state:floor_lamp_1=off", "remove:vase_1" or "swap:plant_1,floor_lamp_2". Names are those of
-    instances, with "_" or "+" for a space; where several doors or windows have one name, ".2" is the second.
+    With `cache` it is generated once, in seconds, and then mapped from disk like imported scenes, until the compiled
+    core changes. An edit changes one thing and leaves everything else unchanged, with light baked for the edited
+    apartment: "color:sofa_1=blue", "state:floor_lamp_1=off", "remove:vase_1" or "swap:plant_1,floor_lamp_2". Names are
+    those of instances, with "_" or "+" for a space; if several doors or windows share a name, ".2" is the second.
 
     Raises:
         ArgumentError: `split` is not "train", "val" or "test"; or an edit cannot be done, with what is possible.
@@ -38,7 +38,7 @@ def apartment(seed: int, split: str = "val", cache: bool = True, *, edits: Seque
     def make() -> Scene:
         started = time.perf_counter()
         scene = _core.scene.apartment(seed, split, edits)
-        _log.info("%s made in %.1f s", scene.name, time.perf_counter() - started)
+        _log.info("%s built in %.1f s", scene.name, time.perf_counter() - started)
         return scene
 
     identity: list[str | int] = ["apartment", store.build_digest(), split, int(seed), *edits]
@@ -46,10 +46,10 @@ def apartment(seed: int, split: str = "val", cache: bool = True, *, edits: Seque
 
 
 def apartment_table(seed: int, split: str = "val", *, edits: Sequence[str] = ()) -> Scene:
-    """Return rooms and instances of an apartment without its textures and light, in a small part of the time.
+    """Return rooms and instances of an apartment without its textures and light, in a fraction of the time.
 
-    `instances`, `rooms`, `attributes` and all triangles are those of `apartment`, so that it serves for questions and
-    for navigation meshes; pictures of it show plain colours.
+    `instances`, `rooms`, `attributes` and all triangles are those of `apartment`, so it is suitable for questions and
+    navigation meshes; renderings of it show plain colours.
     """
     return _core.scene.apartment_outline(seed, split, _core.scene.canonical_edits(list(edits)))
 

@@ -20,9 +20,9 @@ from wiw.scenes.specs import is_generated, parse_single
 Scene = _core.scene.Scene
 
 MOST_MISSING = 0.05
-"""Share of a scan's surface whose texture may be missing."""
+"""Largest share of a scan's surface whose texture may be missing."""
 ALLOW_VARIABLE = "WIW_ALLOW_MISSING_TEXTURES"
-"""Environment variable that allows more, also in the processes that a run starts."""
+"""Environment variable that allows more, also for processes that a run starts."""
 
 _log = logging.getLogger("wiw.scenes")
 
@@ -38,22 +38,22 @@ def load(
     texture_folders: Sequence[str | PathLike[str]] = (),
     model_folders: Sequence[str | PathLike[str]] = (),
 ) -> Scene:
-    """Reads a GLB, glTF, OBJ, PLY or DAE mesh, a Gazebo `.world` or `.sdf` file, or a real scan.
+    """Read a GLB, glTF, OBJ, PLY or DAE mesh, a Gazebo `.world` or `.sdf` file, or a real scan.
 
-    A scan is opened by its mesh, and known by the files beside it (`docs/real-scans.md`).
+    A scan is opened by its mesh, and recognised by the files next to it (`docs/real-scans.md`).
 
     Args:
-        path: the file; `~` is understood.
+        path: the file; `~` is expanded.
         up: "y", "z" or None: by the file (COLLADA header; Y for glTF, OBJ and PLY; Z for scans and for names in HM3D's
             layout). The rule that was used is `scene.attributes["up"]`.
-        ceiling: closes a scene that is open above, in metres above its floor.
-        cache: keep the imported scene on disk (`$WIW_CACHE` or `~/.cache/wiw`) and map it the next time.
-        isolate: import in a process of its own, so that a file that crashes the reader raises FileError here.
+        ceiling: height in metres above the floor at which to close a scene that is open above.
+        cache: cache the imported scene on disk (`$WIW_CACHE` or `~/.cache/wiw`), to be mapped the next time.
+        isolate: import in a separate process, so that a file that crashes the reader raises FileError here.
         limits: raises or lowers the import limits: file_bytes, triangles, nodes, texture_pixels, texture_bytes.
-        texture_folders: searched for textures by base name, after the places beside the file.
-        model_folders: searched for `model://` of a world, before the places beside the file.
+        texture_folders: folders searched for textures by base name, after the places next to the file.
+        model_folders: folders searched for a world's `model://`, before the places next to the file.
 
-    What had to be left out, such as a texture that is missing, is logged and listed in `scene.warnings`.
+    Whatever had to be left out, such as a missing texture, is logged and listed in `scene.warnings`.
 
     Raises:
         FileError: naming file and cause: missing, damaged, unsupported or above the limits.
@@ -110,8 +110,8 @@ def open_scene(name: str) -> Scene:
         cause = next((warning for warning in scene.warnings if "texture" in warning or "image" in warning), "")
         raise FileError(
             f"{name}: {scene.missing_texture_share:.0%} of its surface lacks its texture and would be drawn grey "
-            f"({cause}); at most {MOST_MISSING:.0%} may. Put the textures where the file names them, or allow it with "
-            f"--allow-missing-textures ({ALLOW_VARIABLE}=1)"
+            f"({cause}); at most {MOST_MISSING:.0%} is allowed. Put the textures where the file expects them, or allow "
+            f"it with --allow-missing-textures ({ALLOW_VARIABLE}=1)"
         )
     return scene
 

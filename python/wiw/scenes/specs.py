@@ -14,7 +14,7 @@ from wiw.scenes.scans import formats
 from wiw.suggestions import did_you_mean
 
 SPLIT_SIZE = 1000
-"""Apartments that a spec without a number stands for."""
+"""Number of apartments in a spec without a number."""
 APARTMENTS = r"apartments:(train|val|test)(?:(?::([0-9]+))?:([1-9][0-9]*)|/([0-9]+))?"
 """Split, first, end, and number of a single one. A single one may be followed by "?" and edits, joined by "&"."""
 _FORMS = (
@@ -34,7 +34,7 @@ def strip_edits(spec: str) -> str:
 
 
 def absolute(spec: str | PathLike[str]) -> str:
-    """Return the spec with its path, if it is one, made absolute, so that it means the same in any folder."""
+    """Return the spec, made absolute if it is a path, so that it means the same in any folder."""
     spec = fspath(spec)
     scan = formats.parse_spec(spec)
     if scan is not None:
@@ -44,16 +44,16 @@ def absolute(spec: str | PathLike[str]) -> str:
 
 
 def resolve(spec: str | PathLike[str]) -> list[str]:
-    """Return the single scenes that a scene spec names, in order, none of them loaded.
+    """Return the single scenes that a scene spec names, in order, without loading them.
 
     "apartments:val" and "apartments:val:40" are the first 1000 or 40 apartments of a split, "apartments:val:40:60" are
     numbers 40 to 59, each named "apartments:val/7"; "hm3d:DIR:val" is each scan of a dataset's split, by its file (see
     `wiw.scenes.scans.formats.KINDS`); anything else is the path of a mesh or a Gazebo world. The edits of
-    "apartments:val/7?state:floor_lamp_1=off&color:sofa_1=blue" come in one order and spelling, so that equal scenes
-    have equal names; whether the apartment can have them is found when it is opened.
+    "apartments:val/7?state:floor_lamp_1=off&color:sofa_1=blue" are put into canonical order and spelling, so that equal
+    scenes have equal names; whether the apartment allows them is checked when it is opened.
 
     Raises:
-        ArgumentError: the split or the count is not one, or an edit is not one.
+        ArgumentError: the split, the count or an edit is invalid.
         FileError: there is no such file, or no scan in the folder.
     """
     spec = fspath(spec)
@@ -80,7 +80,7 @@ def resolve(spec: str | PathLike[str]) -> list[str]:
 
 
 def _resembles_generated(spec: str) -> bool:
-    """Return whether a spec is no file and looks like a misspelt `apartments:`, to be refused as it was typed."""
+    """Return whether a spec is not a file and looks like a misspelt `apartments:`, to be refused as typed."""
     kind, colon, _ = spec.partition(":")
     return bool(colon and did_you_mean(kind, ["apartments"])) and not Path(spec).expanduser().exists()
 
@@ -103,7 +103,7 @@ def parse_single(spec: str) -> tuple[int, str, list[str]]:
 
 
 def _did_you_mean(spec: str) -> str:
-    """Return a hint at a split, or at a file beside the one that is not there."""
+    """Return a hint at a split, or at a similar file next to the missing one."""
     path = Path(spec).expanduser()
     kind, colon, rest = spec.partition(":")
     if did_you_mean(kind, ["apartments"]):

@@ -147,7 +147,7 @@ def _picture(
     shown: NDArray[np.int64],
     options: NavigationCollection,
 ) -> list[tuple[bytes, bytes]]:
-    """Return colour and depth of the frames `shown`, encoded; depth is empty where none is wanted.
+    """Return colour and depth of the frames `shown`, encoded; depth is empty if none is wanted.
 
     Panoramas are rendered facing the traversal's north and rolled, so that what is seen from one position is the same
     to the last bit whichever way the agent faces.

@@ -129,7 +129,7 @@ def plan_traversal(
         island: index into `navmesh.islands`.
         key: all randomness derives from it.
         rules: the numbers of the algorithm.
-        max_frames: at most so many frames, if that is less than the rules allow.
+        max_frames: maximum number of frames, if lower than the rules allow.
     """
     waypoints = Waypoints(navmesh, island, core.fold_key([key, 0]), rules)
     north = 2 * np.pi * float(core.uniform(core.fold_key([key, 1]), 1)[0])
@@ -286,7 +286,7 @@ class Follower:
         return [*kept, *((nearest + offset) % HEADINGS for offset in offsets)]
 
     def _step_end(self, heading: int, start: NDArray[np.float32] | None = None) -> NDArray[np.float32] | None:
-        """Return where a step forward leads, by the rule of environments: None where its end is off the mesh."""
+        """Return where a step forward leads, by the rule of environments: None if its end is off the mesh."""
         yaw = self.north + heading * TURN_RAD
         position = self.position if start is None else start
         end = (position.astype(np.float64) + STEP_M * np.array([-np.sin(yaw), 0, -np.cos(yaw)])).astype(np.float32)

@@ -15,7 +15,7 @@ RIDGE = 0.3
 
 
 class Climber(Matcher):
-    """Estimates from real observations what a world model would imagine: in which direction the match improves.
+    """Estimates from real observations what a world model would imagine: the direction in which the match improves.
 
     Its score without a world model is the fair baseline for the question whether imagination was needed at all.
     """

@@ -31,11 +31,11 @@ class Ways:
     """The shortest ways from N places to all cells."""
 
     metres: NDArray[np.float64]
-    """float64 [N, cells]; inf where there is none."""
+    """float64 [N, cells]; inf if there is none."""
     azimuths: NDArray[np.float64]
     """float64 [N, cells]: direction in which it begins, straight to its first bend, in the frame of the start."""
     before: NDArray[np.int32]
-    """int32 [N, cells]: the cell before each, itself where there is none."""
+    """int32 [N, cells]: the cell before each, itself if there is none."""
     cells: WayCells
 
     def take(self, rows: slice) -> Ways:

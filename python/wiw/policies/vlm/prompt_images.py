@@ -70,7 +70,7 @@ def _draw_box(view: Image, box: Box | None) -> Image:
 
 
 def render_target(observation: Observation) -> Image | None:
-    """Return the view centred on the target, boxed; None where it is out of sight."""
+    """Return the view centred on the target, boxed; None if it is out of sight."""
     assert observation.target is not None
     views = cut_target_views(observation.panorama[None], observation.target.mask[None], (VIEW, VIEW))
     return views.images[0] if len(views.images) else None

@@ -24,7 +24,7 @@ SURFACE = int(GRID.encode([0, 0, TABLE, 0, 0, 0, 0])[2])
 NUMBER_LIMIT = 1_000_000
 """Numbers beyond it are not off by a bin or two, but nonsense."""
 MAX_SHOWN = 5
-"""Most poses of a plan that are shown."""
+"""Maximum number of poses of a plan that are shown."""
 SCENE_WORDS = "A robot arm works at a table. "
 """Text that world models read before a plan in words."""
 

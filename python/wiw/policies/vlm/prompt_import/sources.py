@@ -122,7 +122,8 @@ def name_template(title: str) -> str | None:
 def _require_new(found: Mapping[str, FoundPrompt], own: Mapping[str, FoundPrompt]) -> None:
     for name in own.keys() & found.keys():
         raise PromptError(
-            f"{own[name].place}: a second prompt for {name}; the first is at {found[name].place}; give one of the files"
+            f"{own[name].place}: a second prompt for {name}; the first is at {found[name].place}; give only one of the "
+            "files"
         )
 
 

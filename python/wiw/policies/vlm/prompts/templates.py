@@ -79,7 +79,7 @@ def list_tasks() -> list[str]:
 
 
 class Prompts:
-    """Templates of all tasks: a user's where there are any, else those shipped with the package.
+    """Templates of all tasks: a user's if there are any, else those shipped with the package.
 
     Args:
         source: name of a shipped set (`SETS`), or a folder with templates as `<task>/<name>.j2`, named like the shipped
@@ -115,7 +115,7 @@ class Prompts:
         """
         place = f"{task}/{name}.j2"
         if place not in self._templates:
-            raise ArgumentError(f"policy vlm: no prompt '{name}' for task '{task}'; there are some for {list_tasks()}")
+            raise ArgumentError(f"policy vlm: no prompt '{name}' for task '{task}'; it exists for {list_tasks()}")
         path, source = self._templates[place]
         own = place in self._own
         text = self._filling.fill(path, source, slots) if own else template_worker.fill_template(source, slots)
@@ -136,7 +136,9 @@ class Prompts:
             )
         for name, (path, source) in own.items():
             if name not in self._templates:
-                raise PromptError(f"{path}: no prompt has this name; there are {', '.join(sorted(self._templates))}")
+                raise PromptError(
+                    f"{path}: no prompt has this name; expected one of {', '.join(sorted(self._templates))}"
+                )
             # tried on, so that what is wrong is known before the first question
             self._filling.fill(path, source, get_slots(path.parent.name), check=True)
         return own

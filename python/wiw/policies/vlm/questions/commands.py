@@ -42,10 +42,10 @@ class Command:
     view: int
     """Number of the view to go on in."""
     mark: int | None = None
-    """Number of the landmark in the pictures; None where the words alone say what to do."""
+    """Number of the landmark in the pictures; None if the words alone say what to do."""
     landmark: Landmark | None = None
     answer: str = ""
-    """Answer to the question; empty where it cannot be answered yet."""
+    """Answer to the question; empty if it cannot be answered yet."""
 
     def to_prompt(self) -> dict[str, Any]:
         """Return the command as models write it, for the prompts that come after it."""
@@ -58,7 +58,7 @@ def command_schema(marks: tuple[int, ...], count: int = 1, answers: bool = True)
 
     Args:
         marks: numbers of the landmarks that may be chosen.
-        count: how many commands are asked for.
+        count: how many commands are requested.
         answers: whether a command comes with an answer; not where imagined views are shown.
     """
     from pydantic import ConfigDict, Field, create_model, field_validator
@@ -123,7 +123,7 @@ def parse_walk(value: Any) -> NDArray[np.int8]:
 
 
 def parse_answer(value: Any) -> str:
-    """Return the answer of a validated reply; empty where there is none."""
+    """Return the answer of a validated reply; empty if there is none."""
     return shorten(getattr(value, "answer", None) or "")
 
 

@@ -19,7 +19,7 @@ from wiw.perception.scene_labels import STATES, SceneLabels
 from wiw.types import Observation
 
 UNMARKED = (*BACKGROUND, "opening")
-"""Categories that are no landmarks. Openings are found by depth, which is surer than labels."""
+"""Categories that are not landmarks. Openings are found by depth, which is surer than labels."""
 MOVED = 0.05
 """Metres below which a walk has led nowhere."""
 

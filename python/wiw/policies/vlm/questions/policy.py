@@ -46,7 +46,7 @@ class QuestionMemory(Memory):
     commands: dict[bytes, Command] = field(default_factory=dict)
     """Commands of the present decision by the plans that they became."""
     answer: tuple[Key, str] | None = None
-    """The planner's latest answer, empty where it gave none, and at which decision."""
+    """The planner's latest answer, empty if it gave none, and at which decision."""
     executed: int = 0
     """Primitives that had been executed at the latest observation."""
     history: list[str] = field(default_factory=list)
@@ -94,8 +94,8 @@ class QuestionVLM(VLM):
         self.labeller: Labeller = LABELLERS.make(perception)
         if "ids" in self.labeller.needs:
             raise ArgumentError(
-                f"policy vlm: {type(self.labeller).__name__} reads the simulator's instance ids, which no agent is "
-                "given; expected perception that sees images alone, such as learned"
+                f"policy vlm: {type(self.labeller).__name__} needs the simulator's instance ids, which agents never "
+                "see; expected perception that uses only images, such as learned"
             )
         self.history, self.order = history, order
         self.needs = ("depth",)
@@ -322,7 +322,7 @@ class QuestionVLM(VLM):
 
 
 def _get_answer(situation: Situation) -> str | None:
-    """Return the answer of this decision's planner, empty where it has none; None where it was not asked."""
+    """Return the answer of this decision's planner, empty if it has none; None if it was not asked."""
     latest = situation.memory.answer
     return None if latest is None or latest[0] != situation.key else latest[1]
 
