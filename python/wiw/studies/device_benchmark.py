@@ -137,8 +137,7 @@ def benchmark_device(
     peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 2**10
     notes = [
         f"This process took {peak:.0f} MB of main memory at most; load {os.getloadavg()[0]:.1f} at the end.",
-        "A training step is a pass, the mean square of its outputs, the gradient and AdamW. The diffuser has random "
-        "weights, for none are shipped.",
+        "A training step is a pass, the mean square of its outputs, the gradient and AdamW.",
     ]
     return DeviceBenchmark(devices, describe_platform(), found, not_run, notes)
 
