@@ -106,8 +106,7 @@ def connect_cluster(address: str | None) -> Iterator[Any]:
 def run_tasks(
     place: Engine, function: Callable[[Item], Any], items: Sequence[Item], workers: int
 ) -> Iterator[tuple[Item, Any]]:
-    """Call a function on each item as tasks of Ray, at most `workers` at a time; yield items and results as they
-    arrive.
+    """Call a function on items as Ray tasks, at most `workers` at a time; yield items and results as they arrive.
 
     A task whose process or node is lost is repeated. Tasks run in this process's folder, so that relative paths hold.
 
