@@ -32,7 +32,7 @@ def end_with_parent(parent: int) -> None:
 
 
 def limit_time(seconds: float) -> None:
-    """End this process after so many seconds, or so many on all processors together."""
+    """End this process after some seconds of wall-clock time, or of time on all processors together."""
     signal.signal(signal.SIGALRM, signal.SIG_DFL)
     signal.alarm(max(1, math.ceil(seconds)))
     _, hard = resource.getrlimit(resource.RLIMIT_CPU)

@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """Run work on a Ray cluster, possibly of this machine alone: connections, tasks, and batches for pools of actors.
 
-Only plain values are sent and returned; nothing of Ray's gets into results. Ray is imported only when needed.
+Only plain values are sent and returned; Ray does not influence results. Ray is imported only when needed.
 """
 
 from __future__ import annotations
@@ -25,7 +25,7 @@ STORE_BYTES = 200_000_000
 """Size of a local cluster's object store in bytes: messages are small, and containers often have 64 MB of shared
 memory."""
 RETRIES = 2
-"""How often a task is repeated after its process or node is lost."""
+"""Maximum number of repetitions of a task whose process or node is lost."""
 FAILED = "wiw error"
 """Column of a Ray Data result that is an error: the name of its class; "text" is the message."""
 
@@ -76,7 +76,7 @@ def connect_cluster(address: str | None) -> Iterator[Any]:
 
     Raises:
         DependencyError: ray is not installed.
-        InfrastructureError: there is no cluster at the address.
+        InfrastructureError: no cluster at the address.
     """
     ray = import_ray()
     if ray.is_initialized():
@@ -106,7 +106,7 @@ def connect_cluster(address: str | None) -> Iterator[Any]:
 def run_tasks(
     place: Engine, function: Callable[[Item], Any], items: Sequence[Item], workers: int
 ) -> Iterator[tuple[Item, Any]]:
-    """Call a function on each item as tasks of Ray, at most `workers` at a time; yield items and results as they come.
+    """Call a function on items as Ray tasks, at most `workers` at a time; yield items and results as they arrive.
 
     A task whose process or node is lost is repeated. Tasks run in this process's folder, so that relative paths hold.
 
@@ -137,7 +137,7 @@ def map_batches(
     workers: int,
     batch: int,
 ) -> Iterator[dict[str, Any]]:
-    """Give rows to a pool of actors, a batch at a time, by Ray Data; yield rows of their answers as they come.
+    """Give rows to a pool of actors, a batch at a time, by Ray Data; yield rows of their answers as they arrive.
 
     Args:
         place: where.

@@ -74,7 +74,7 @@ class Registry:
         return self.find_here(name)
 
     def is_foreign(self, name: str) -> bool:
-        """Return whether a name stands for code in a file or package that does not ship with wiw."""
+        """Return whether a name refers to code in a file or package that does not ship with wiw."""
         if name in self.registered or name in self.built_in or name.partition(":")[0] + ":" in self.built_in:
             return False
         plugins = self._list_plugins()

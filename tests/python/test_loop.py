@@ -303,7 +303,7 @@ def test_models_are_refused_that_ask_for_what_nobody_gives() -> None:
 
     for declared, said in [
         ({"needs": ("depth", "semantic")}, "needs semantic"),
-        ({"needs": ("simulator",)}, "oracle alone"),
+        ({"needs": ("simulator",)}, "only the oracle"),
         ({"space": "pose7"}, "discrete primitives"),
         ({"needs": ("depth",), "frames": 4}, "have up to 5"),
     ]:

@@ -147,7 +147,7 @@ def test_other_tasks_have_no_tasks(capsys: Any) -> None:
     assert main(["run", "imagenav", "--tasks", "push_buttons", "--policy", "heuristic"]) == 2
     assert "unknown rule 'tasks'" in capsys.readouterr().err
     assert main(["episodes", "manipulation"]) == 2
-    assert "a function of the seed" in capsys.readouterr().err
+    assert "determined by the seed" in capsys.readouterr().err
 
 
 def test_a_run_has_as_many_episodes_as_the_preset_says(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -246,7 +246,7 @@ def test_the_command_line(tmp_path: Path, two_rooms: str, capsys: pytest.Capture
     printed = capsys.readouterr()
     assert "segments of 1 scenes" in printed.out and "scenes: 1/1, " in printed.err
     assert main([*asked, "--out", str(out), "--preset", "paper"]) == 2
-    assert "holds another collection" in capsys.readouterr().err
+    assert "holds a different collection" in capsys.readouterr().err
     assert main(["data", "stats", str(out)]) == 0
     printed = capsys.readouterr()
     assert "windows of 14 frames" in printed.out and "two_rooms" in printed.out and "forward" in printed.out

@@ -93,7 +93,7 @@ def test_it_ends_with_every_end_of_a_task(end, service, made):
 def test_a_task_that_takes_for_ever_is_given_up_and_found_again(service, made):
     service.plan = ("THROTTLED",)
     model = made(patience=0.05)
-    with pytest.raises(InfrastructureError, match="have not ended"):
+    with pytest.raises(InfrastructureError, match="have not finished"):
         rollout(model)
     service.plan = ("SUCCEEDED",)
     rollout(model)

@@ -184,7 +184,7 @@ class TestMatterport:
             (lambda text: text.replace("\nO 6", "\nX 6"), "has 6 objects, but its header says 7"),
             (lambda text: text.replace("R 1 0", "R 3 0"), "line .*: not a house record 'O' .*region 1 does not exist"),
             (lambda text: text.replace("C 4 104", "C x 104"), "line .*: not a house record 'C'"),
-            (lambda text: text.replace("O 2 0 2 1.2", "O 2 0 2 nan"), "line .*: no record 'O' .*not finite"),
+            (lambda text: text.replace("O 2 0 2 1.2", "O 2 0 2 nan"), "line .*: not a house record 'O' .*not finite"),
             (lambda text: "ASCII 1.1\n", "has no header record"),
         ],
     )
@@ -282,7 +282,7 @@ class TestHm3d:
             ('x,00FF00,"bed",0', "line 2: expected id,RRGGBB"),
             ('1,GG0000,"bed",0', "line 2: expected id,RRGGBB"),
             ('1,00FF00,"bed"', "line 2: expected id,RRGGBB"),
-            ('1,00FF00,"bed",0\n1,00FF01,"sofa",0', "line 3: .*is there already"),
+            ('1,00FF00,"bed",0\n1,00FF01,"sofa",0', "line 3: .*already used"),
         ],
     )
     def test_a_damaged_table_is_named(self, tmp_path: Path, row: str, message: str) -> None:
@@ -346,8 +346,11 @@ class TestReplica:
         ("text", "message"),
         [
             ("{", "not a Replica table"),
-            ('{"classes": [{"id": 1, "name": "a"}], "objects": [{"id": 3, "class_id": 7}]}', "no table .*KeyError: 7"),
-            ('{"objects": []}', "no table .*KeyError: 'classes'"),
+            (
+                '{"classes": [{"id": 1, "name": "a"}], "objects": [{"id": 3, "class_id": 7}]}',
+                "not a Replica table .*KeyError: 7",
+            ),
+            ('{"objects": []}', "not a Replica table .*KeyError: 'classes'"),
         ],
     )
     def test_a_damaged_table_is_named(self, tmp_path: Path, text: str, message: str) -> None:
@@ -447,7 +450,7 @@ class TestSceneDataset:
         with pytest.raises(FileError) as caught:
             load(path)
         message = str(caught.value)
-        assert "home.scene_instance.json: 3 things" in message
+        assert "home.scene_instance.json: 3 objects" in message
         assert all(name in message for name in ("objects: chair", "part.glb", "front.glb"))
 
     def test_the_navigation_mesh_that_the_scene_names_is_used(self, tmp_path: Path) -> None:

@@ -322,7 +322,7 @@ def test_a_damaged_cache_is_rebuilt_with_a_warning(
         file.write_bytes(damage)
         with caplog.at_level(logging.WARNING, "wiw.scenes"):
             assert scenes.load(mesh, isolate=False).triangle_count == 2
-        assert "built again" in caplog.text
+        assert "rebuilt" in caplog.text
         caplog.clear()
     file.unlink()
     assert scenes.load(mesh, isolate=False).triangle_count == 2

@@ -77,7 +77,7 @@ def test_shards_are_a_partition_of_about_equal_parts(episodes, count):
 def test_no_shard_is_refused(tmp_path, text):
     with pytest.raises(ArgumentError, match=f"shard I/N .* got '{text}'"):
         begin(tmp_path / "run", shard=text)
-    with pytest.raises(ArgumentError, match="there are 2 episodes"):
+    with pytest.raises(ArgumentError, match="with 2 episodes"):
         begin(tmp_path / "run", 2, shard="3/3")
     assert not (tmp_path / "run").exists()
 

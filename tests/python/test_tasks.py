@@ -90,7 +90,7 @@ def test_an_unknown_reset_option_is_refused(make: Any, two_rooms: str) -> None:
 def test_what_an_environment_lacks_is_named() -> None:
     env = TASKS.make(f"{EXAMPLES / 'corridor.py'}:Corridor").environment()
     for use, message in (
-        (env.fork, "CorridorEnv has no simulator.*write `CorridorEnv.fork`"),
+        (env.fork, "CorridorEnv has no simulator.*implement `CorridorEnv.fork`"),
         (env.guide, "wiw blame.*CorridorEnv.guide"),
         (env.semantic, "--semantics simulator"),
     ):

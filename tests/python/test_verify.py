@@ -103,5 +103,5 @@ def test_what_cannot_be_verified_says_why(run, tmp_path):
         wiw.verify(run, episodes=0)
     with sqlite3.connect(store_path(run)) as store:
         store.execute("DELETE FROM outcome")
-    with pytest.raises(StoreError, match="no ended episode"):
+    with pytest.raises(StoreError, match="no finished episode"):
         wiw.verify(run)

@@ -3,7 +3,7 @@
 
 Readers of 3D formats are large programs that trust their input: a damaged file can make one crash, hang or eat all
 memory. In a child process each of these becomes a FileError, and a run of many scenes continues. The child ends with
-its parent, and has limits of time and memory of its own.
+its parent, and has its own limits of time and memory.
 """
 
 from __future__ import annotations
@@ -44,7 +44,7 @@ def read_in_child(module: str, job: dict[str, Any]) -> dict[str, Any]:
 
     Raises:
         FileError: the file is damaged, also where that ends the child: a crash, a time-out, no memory left.
-        ArgumentError: what the file asks for cannot be.
+        ArgumentError: an option of the job is not valid.
         InfrastructureError: the child could not do its work, whatever the file.
     """
     path = job["path"]

@@ -54,7 +54,7 @@ def resolve(spec: str | PathLike[str]) -> list[str]:
 
     Raises:
         ArgumentError: the split, the count or an edit is invalid.
-        FileError: there is no such file, or no scan in the folder.
+        FileError: the file does not exist, or the folder has no scan.
     """
     spec = fspath(spec)
     scan = formats.parse_spec(spec)

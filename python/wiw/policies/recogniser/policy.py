@@ -127,7 +127,7 @@ class Recognition(Policy):
             memory.looks = [*others, (here, found)][-self.remember :]
 
     def propose(self, situations: Sequence[Situation], candidates: int, horizon: int) -> list[list[Proposal]]:
-        """Return different ways to a better view, the most promising first."""
+        """Return different paths to a better view, the most promising first."""
         return [self._build_plans(situation, candidates, horizon) for situation in situations]
 
     def _build_plans(self, situation: Situation, candidates: int, horizon: int) -> list[Proposal]:

@@ -116,7 +116,7 @@ class VLM(Policy):
     tracks: bool = True
     """Whether there are tasks among them that point something out."""
     shows_front = True
-    """Whether it is shown the agent's front view alone, rather than views of its own."""
+    """Whether it is only shown the agent's front view, rather than its own views."""
     fallback_action = "a primitive was drawn"
     """Description of the fallback where no plan can be used."""
 
@@ -382,7 +382,7 @@ class VLM(Policy):
     def _show_plans(
         self, proposals: Sequence[Proposal], rollouts: Sequence[Rollout], tracks: Sequence[Track | None] | None = None
     ) -> list[Part]:
-        """Return each plan in words, and then what it is imagined to lead to."""
+        """Return each plan in words, followed by its imagined outcome."""
         parts: list[Part] = []
         rows = zip(proposals, rollouts, tracks or [None] * len(proposals), strict=True)
         for number, (plan, rollout, track) in enumerate(rows, 1):

@@ -24,13 +24,13 @@ Image = NDArray[np.uint8]
 
 
 def render_observation(observation: Observation, side: int | None = None) -> tuple[Image, Image]:
-    """Return front view, of so many pixels a side, and panorama, with the target's box where there is a target."""
+    """Return front view, this many pixels a side, and panorama, with the target's box where there is a target."""
     shown = observation.as_dict()
     return resize_view(shown["front"], side), shown["panorama"]
 
 
 def resize_view(view: Image, side: int | None) -> Image:
-    """Return a square view with so many pixels a side; as it is where none are given."""
+    """Return a square view with this many pixels a side; as it is where none are given."""
     if side is None or view.shape[:2] == (side, side):
         return view
     return np.asarray(cv2.resize(view, (side, side), interpolation=_choose_interpolation(view, side)), np.uint8)

@@ -33,7 +33,7 @@ class ImportedPrompts:
     digest: str
     """Digest of all templates, as runs record it."""
     imported: Mapping[str, str]
-    """Where in the source each template was found, by its name."""
+    """Place in the source of each template, by its name."""
     completed: Mapping[str, str] = field(default_factory=dict)
     """Which built-in set each of the other templates is from."""
     unused: tuple[str, ...] = ()

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Where the paper's prompts stand: in boxes of its LaTeX source, or in files of its published code."""
+"""Sources of the paper's prompts: in boxes of its LaTeX source, or in files of its published code."""
 
 from __future__ import annotations
 
@@ -148,7 +148,7 @@ def _join_files(files: list[Path]) -> FoundPrompt:
 
 
 def _read_variables(file: Path) -> dict[str, FoundPrompt]:
-    """Return the prompts that a Python file assigns as plain strings; nothing of it is run."""
+    """Return the prompts that a Python file assigns as plain strings; none of it is run."""
     try:
         tree = ast.parse(_read_text(file))
     except SyntaxError as error:

@@ -24,7 +24,7 @@ if TYPE_CHECKING:
     from pydantic import BaseModel
 
 WALK_ACTIONS, WALK_TIMES = 4, 4
-"""Most different actions of a walk, and most times that each is repeated, as in the published code."""
+"""Maximum number of different actions in a walk, and of repetitions of each, as in the published code."""
 STOP = "stop"
 WALK_NAMES = (*PRIMITIVES, STOP)
 LONGEST_ANSWER = 300
@@ -40,7 +40,7 @@ class Command:
     plan: str
     """In its words."""
     view: int
-    """Number of the view to go on in."""
+    """Number of the view to continue in."""
     mark: int | None = None
     """Number of the landmark in the pictures; None if the words alone say what to do."""
     landmark: Landmark | None = None
@@ -48,7 +48,7 @@ class Command:
     """Answer to the question; empty if it cannot be answered yet."""
 
     def to_prompt(self) -> dict[str, Any]:
-        """Return the command as models write it, for the prompts that come after it."""
+        """Return the command as models write it, for later prompts."""
         return {"action_plan": self.plan, "chosen_view": VIEW_NAMES[self.view], "chosen_landmark": self.mark}
 
 

@@ -59,13 +59,13 @@ class QuestionVLM(VLM):
     At each decision the *high-level planner* sees the question and four real views, with landmarks marked and without.
     It commands to go to a landmark or in the direction of a view, and answers if it can. The *low-level planner* makes
     primitives of commands: a route to a landmark over floor that depth has shown; for words, a walk that the model
-    writes. With a world model each of M commands is imagined, and a question with the views at their ends asks for the
-    command to follow. Answers come from the planner, who is shown real views alone.
+    writes. With a world model each of M commands is imagined, and a question with the views at their ends selects the
+    command to follow. Answers come from the planner, who is only shown real views.
 
     Args:
         args, options: as of `VLM`.
         perception: finds the landmarks: "learned", "detector" (a detector and a segmenter), or a `Labeller`.
-        history: the planner is told its latest commands, so many of them; 0: it has no memory of them.
+        history: number of its latest commands that the planner is told; 0: it has no memory of them.
         order: which picture of the real views comes first, "marked_first" or "plain_first".
 
     Raises:
@@ -268,7 +268,7 @@ class QuestionVLM(VLM):
     def revise(
         self, situation: Situation, proposals: Sequence[Proposal], scores: NDArray[np.float64]
     ) -> tuple[NDArray[Any], int | None]:
-        """Return the decided plan, and remember its command for the prompts to come."""
+        """Return the decided plan, and remember its command for later prompts."""
         actions, chosen = super().revise(situation, proposals, scores)
         memory: QuestionMemory = situation.memory
         command = memory.commands.get(actions.tobytes())
