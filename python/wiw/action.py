@@ -67,13 +67,14 @@ class GripperVocabulary:
 
 @dataclass(frozen=True)
 class PoseGrid:
-    """Gripper poses as whole numbers [X, Y, Z, roll, pitch, yaw, gripper], as language models write them.
+    """Gripper poses as whole numbers [X, Y, Z, roll, pitch, yaw, gripper], as written by language models.
 
-    With bins of size r = (high - low) / bins, X stands for the middle of bin X, low + r (X + 1/2); R for the angle
-    R 2 pi / turns - pi, extrinsic x, y, z; the gripper is 0 closed or 1 open. Prompts name 0 to `bins` and 0 to `turns`
-    as the range, so that 100 and 120 do come: the last bin stands for 100, and 120 is 0 again.
+    With bins of size r = (high - low) / bins, X stands for the middle of bin X, low + r (X + 1/2); R for the angle R 2
+    pi / turns - pi, extrinsic x, y, z; the gripper is 0 closed or 1 open. Prompts give 0 to `bins` and 0 to `turns` as
+    the range, so 100 and 120 do occur: 100 is taken as the last bin, and 120 as 0.
 
-    Source: the paper, appendix "Robotic Manipulation", after EmbodiedBench; its workspace of 1 m a side is the default.
+    Source: the paper, appendix "Robotic Manipulation", after EmbodiedBench; its workspace, 1 m on each side, is the
+    default.
     """
 
     low: tuple[float, float, float] = (-0.3, -0.5, 0.6)
@@ -86,7 +87,8 @@ class PoseGrid:
             raise ArgumentError(f"PoseGrid: expected low < high, 3 metres each, and at least one bin, got {self}")
 
     def encode(self, poses: ArrayLike) -> NDArray[np.int64]:
-        """Int64 [..., 7] of float [..., 7]: positions out of bounds go to the outermost bins, angles to the nearest.
+        """Encode float [..., 7] as int64 [..., 7]: positions out of bounds go to the outermost bins, angles to the
+        nearest.
 
         Raises:
             ArgumentError: not finite, or of another shape.
@@ -100,7 +102,8 @@ class PoseGrid:
         return np.concatenate([position, rotation, given[..., 6:] >= 0.5], axis=-1).astype(np.int64)
 
     def decode(self, numbers: ArrayLike) -> NDArray[np.float64]:
-        """Float64 [..., 7] of whole numbers: positions are clamped to the bins, angles wrapped, the gripper 0 or 1.
+        """Decode whole numbers to float64 [..., 7]: positions are clamped to the bins, angles wrapped, the gripper is 0
+        or 1.
 
         Raises:
             ArgumentError: fractions, or another shape.
@@ -123,8 +126,8 @@ def to_text(
 
     Args:
         actions: ids [K], or poses float [K, 7].
-        template: words to use; the default is made for the kind of plan. `TextTemplate(prompt=..., phrases={FORWARD:
-            ...}, separator=..., merge_runs=...)` replaces any part of it.
+        template: words to use; the default suits the kind of plan. `TextTemplate(prompt=..., phrases={FORWARD: ...},
+            separator=..., merge_runs=...)` replaces any part of it.
         space: step sizes that the phrases name; default 0.2 m and 22.5 degrees.
 
     Raises:
@@ -175,7 +178,9 @@ def relative_poses(poses: NDArray[np.float64]) -> NDArray[np.float64]:
 def to_viewpoints(
     actions: ArrayLike, space: ActionSpace | None = None, *, include_start: bool = False
 ) -> NDArray[np.float64]:
-    """The trajectory as camera poses T_start_camera, float64 [..., K, 4, 4] (right +X, up +Y, looking down -Z)."""
+    """Return the trajectory as camera poses T_start_camera, float64 [..., K, 4, 4] (right +X, up +Y, looking down
+    -Z).
+    """
     return np.asarray(_core.to_viewpoints(np.asarray(actions), space or ActionSpace(), include_start))
 
 
@@ -187,7 +192,7 @@ def to_controls(
     Args:
         actions: ids [K] or [..., K]; poses float [K, 7] with a `GripperVocabulary`.
         vocabulary: for ids, a map from primitive (id, `Action` or name, e.g. "turn_left") to the model's id or vector.
-        null_first: put the null token in front, for models that want one token a frame.
+        null_first: put the null token first, for models that expect one token per frame.
 
     Returns:
         int64 [..., K] if all entries are whole numbers, else float64 [..., K] or [..., K, D]; for poses float64 [K, D].
@@ -198,7 +203,7 @@ def to_controls(
     plan = np.asarray(actions)
     if isinstance(vocabulary, GripperVocabulary):
         if null_first:
-            raise ArgumentError("to_controls: poses are absolute, one a frame; put the current pose in front instead")
+            raise ArgumentError("to_controls: poses are absolute, one per frame; prepend the current pose instead")
         rotation = _rotation(vocabulary.rotation)
         return np.asarray(_core.encode_gripper(_poses(plan), rotation, vocabulary.bounds))
     entries = {_action(key): value for key, value in vocabulary.items()}
@@ -212,7 +217,7 @@ def to_controls(
 
 
 def with_null(actions: ArrayLike) -> NDArray[np.int8]:
-    """Ids [..., K] with the null token in front, [..., K + 1]: entry k then belongs to frame k."""
+    """Return ids [..., K] with the null token first, [..., K + 1]: entry k then belongs to frame k."""
     plan = np.asarray(actions)
     front = np.full((*plan.shape[:-1], 1), int(NULL), plan.dtype if plan.size else np.int8)
     return np.concatenate([front, plan.astype(front.dtype)], axis=-1)
@@ -225,7 +230,7 @@ def resample(
     start: ArrayLike | None = None,
     gripper: Literal["step", "nearest"] = "step",
 ) -> NDArray[np.float64]:
-    """Brings a plan of poses to the length a model is conditioned on.
+    """Bring a plan of poses to the length a model is conditioned on.
 
     Longer: linear interpolation, rotations by slerp along the shorter arc. Shorter: uniform sampling of the given
     poses. The last pose is always kept.
@@ -247,7 +252,7 @@ def resample(
     if given.size and not np.issubdtype(given.dtype, np.floating):
         raise ArgumentError(
             f"resample: expected floating-point poses, got {given.dtype} {given.shape}: discrete actions cannot be "
-            "interpolated, use pad() or chunk()"
+            "interpolated; use pad() or chunk()"
         )
     if length < 1:
         raise ArgumentError(f"resample: expected a length of at least 1, got {length}")
@@ -262,7 +267,7 @@ def resample(
 
 
 def pad(actions: ArrayLike, length: int, padding: Padding = "forward") -> NDArray[np.int8]:
-    """Ids [K] filled up to int8 [length] with forward steps, the last action again, or the null token.
+    """Pad ids [K] to int8 [length] with forward steps, repetitions of the last action, or null tokens.
 
     Raises:
         ArgumentError: the plan is longer than `length` (use `chunk`), or empty with padding "repeat".
@@ -271,18 +276,20 @@ def pad(actions: ArrayLike, length: int, padding: Padding = "forward") -> NDArra
 
 
 def chunk(actions: ArrayLike, length: int, padding: Padding = "forward") -> NDArray[np.int8]:
-    """Ids [K] cut into int8 [chunks, length], the last one padded; each is rolled out from the last frame before it."""
+    """Cut ids [K] into int8 [chunks, length], the last one padded; each is rolled out from the last frame of the one
+    before.
+    """
     return np.asarray(_core.chunk(np.asarray(actions), length, padding))
 
 
 def frames_of_actions(count: int, frames: int, fit: Literal["pad", "resample", "chunk"] = "pad") -> NDArray[np.int64]:
-    """Which frame of a model shows the outcome of each action; frame 0 is what a rollout began with.
+    """Return which frame of a model shows the outcome of each action; frame 0 is what a rollout began with.
 
     Args:
         count: number of actions in the agent's plan.
         frames: length of the model's rollout, frame 0 included.
-        fit: how the plan was fitted: "pad" (frame k follows action k), "resample" (the clip covers the plan evenly,
-            the nearest frame is named) or "chunk" (each chunk answers `frames` - 1 actions).
+        fit: how the plan was fitted: "pad" (frame k follows action k), "resample" (the clip covers the plan evenly, and
+            the nearest frame is taken) or "chunk" (each chunk covers `frames` - 1 actions).
 
     Returns:
         int64 [count, 2]: chunk (0 unless chunked) and frame in it.

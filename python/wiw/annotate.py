@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Marks on images for a model or a person to look at: boxes, discs, axes, strips of titled frames.
+"""Annotate images for a model or a person: boxes, discs, axes, strips of titled frames.
 
 Images are uint8 [H, W, 3]; every function returns a new one. Coordinates are pixels, 0 at the left (upper) edge of the
 first pixel. Text is ASCII; other characters are shown as "?". A wrong shape or a number that is not finite raises
@@ -34,8 +34,8 @@ def box(
 ) -> Image:
     """Outline a box (left, top, right, bottom), the line inside it, the label above it.
 
-    left > right means a box across the seam of a panorama: both parts are drawn, open at the seam. `outside` puts the
-    line around the box, as far as the image goes, so that it hides nothing of a small one.
+    left > right means a box across the seam of a panorama: both parts are drawn, open at the seam. `outside` draws the
+    line around the box, within the image, so that it hides nothing of a small one.
     """
     if outside:
         left, top, right, bottom = edges
@@ -48,7 +48,7 @@ def box(
 def mark(
     image: Image, center: Sequence[float], label: str = "", *, color: Color = RED, radius: int = 7, gap: int = 2
 ) -> Image:
-    """Put a disc at (x, y) and a label on a line: ``gap`` pixels to its right, or to its left where negative."""
+    """Draw a disc at (x, y) with a label on a line: ``gap`` pixels to its right, or to its left if negative."""
     return _core.mark(image, list(center), color, radius, label, gap)
 
 
@@ -60,10 +60,11 @@ def axes(image: Image, origin: Sequence[float], ends: Sequence[Sequence[float]],
 def strip(
     frames: Image | Sequence[Image], titles: Sequence[str], *, columns: int | None = None, bar: int = 0, gap: int = 4
 ) -> Image:
-    """Frames [T, H, W, 3] side by side, each under a bar with its title, e.g. "Imagined action 1: forward 0.20 m".
+    """Arrange frames [T, H, W, 3] side by side, each under a bar with its title, e.g. "Imagined action 1: forward 0.20
+    m".
 
-    ``columns`` frames a row (None: all in one), ``bar`` pixels of title (0: to suit the width), ``gap`` pixels between.
-    A title that does not fit is set smaller, then cut with "...".
+    ``columns`` frames per row (None: all in one), ``bar`` pixels of title (0: to suit the width), ``gap`` pixels
+    between. A title that does not fit is set smaller, then cut with "...".
     """
     stacked: Any = np.asarray(frames)
     return _core.strip(stacked, list(titles), columns or 0, bar, gap)

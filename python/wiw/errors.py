@@ -55,7 +55,7 @@ def is_stop_request(error: BaseException) -> bool:
 def find_raising_line(error: BaseException) -> traceback.FrameSummary | None:
     """Return the line of a user's code at which an exception was raised, or that led to it.
 
-    It is the last line outside wiw and installed packages, or else outside wiw; None where no other line was reached.
+    It is the last line outside wiw and installed packages, or else outside wiw; None if no other line was reached.
     """
     frames = traceback.extract_tb(error.__traceback__)
     foreign = [frame for frame in frames if not frame.filename.startswith((OWN, "<"))]
@@ -153,7 +153,7 @@ class VlmError(InfrastructureError):
     """A vision-language model could not be queried after all retries.
 
     `kind` is "unreachable", "timeout", "status" (the server failed or was busy), "refused" (it never will), "protocol"
-    (a reply that is no completion) or "missing" (an answer that was not recorded).
+    (a reply that is not a completion) or "missing" (an answer that was not recorded).
     """
 
     def __init__(self, message: str = "", kind: str = "unreachable") -> None:
@@ -191,4 +191,4 @@ class StoreError(Error):
 
 
 class TrainingError(Error):
-    """A training cannot go on: its loss or its gradient is not finite. The message names the batch."""
+    """A training cannot continue: its loss or its gradient is not finite. The message names the batch."""

@@ -52,7 +52,7 @@ def atomic_folder(path: Path, replace: Callable[[Path], bool] = lambda folder: F
         FileError: `path` holds something already, or cannot be written.
     """
     if path.exists() and (not path.is_dir() or (any(path.iterdir()) and not replace(path))):
-        raise FileError(f"{path} holds something already; expected a folder that is new or empty: name another")
+        raise FileError(f"{path} is not empty; expected a new or empty folder: choose another")
     draft = path.with_name(f".{path.name}.{os.getpid()}.part")
     with _write_draft(path, draft):
         path.parent.mkdir(parents=True, exist_ok=True)
@@ -71,8 +71,8 @@ def _write_draft(path: Path, draft: Path) -> Iterator[None]:
         yield
     except OSError as error:
         raise FileError(
-            f"{path}: cannot be written ({error.strerror or error}); expected a folder with free space and the right "
-            "to write: make room or name another place. Nothing half-written is left"
+            f"{path}: cannot be written ({error.strerror or error}); expected a writable folder with free space: make "
+            "room or choose another place. No partial file is left"
         ) from error
     finally:
         _remove(draft)

@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """`gymnasium.make("wiw/ImageNav-v0", scenes=...)`: the environments in gymnasium's own registry.
 
-`import wiw` does not import gymnasium: where that is not imported yet, the environments are registered once it is.
+`import wiw` does not import gymnasium: if it has not been imported yet, the environments are registered once it is.
 """
 
 from __future__ import annotations
@@ -14,9 +14,14 @@ from types import ModuleType
 from typing import Any
 
 NAMESPACE = "wiw"
-TASKS = {"ImageNav-v0": "imagenav", "AR-v0": "ar", "AEQA-v0": "aeqa", "Manipulation-v0": "manipulation"}
-"""Names of tasks by gymnasium's names."""
 _REGISTRY = "gymnasium.envs"
+
+
+def list_ids() -> dict[str, str]:
+    """Return the names of the built-in tasks by gymnasium's: "ImageNav-v0", after its class, is "imagenav"."""
+    from wiw.registry import TASKS
+
+    return {f"{place.rpartition(':')[2]}-v0": name for name, place in TASKS.built_in.items()}
 
 
 def register_environments() -> None:
@@ -51,7 +56,7 @@ class _AfterGymnasium(MetaPathFinder):
 def _register() -> None:
     from gymnasium.envs.registration import register, registry
 
-    for name, task in TASKS.items():
+    for name, task in list_ids().items():
         if f"{NAMESPACE}/{name}" not in registry:
             register(
                 f"{NAMESPACE}/{name}",

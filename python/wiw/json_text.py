@@ -30,7 +30,7 @@ def parse_json(text: bytes | str) -> Any:
     except RecursionError:
         deep = True
     if deep:
-        raise ValueError(f"expected at most {MOST_LEVELS} lists and objects in one another, and there are more")
+        raise ValueError(f"expected at most {MOST_LEVELS} levels of nested lists and objects, but there are more")
     return value
 
 

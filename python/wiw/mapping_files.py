@@ -43,7 +43,7 @@ def parse_yaml(text: str) -> Any:
     try:
         return deepcopy(_parse_yaml_once(text))
     except RecursionError:
-        raise ValueError("expected lists and mappings that are nested less deeply") from None
+        raise ValueError("expected less deeply nested lists and mappings") from None
 
 
 @lru_cache(maxsize=64)  # every task reads its presets anew, and parsing takes longer than all else that makes a task
@@ -69,6 +69,6 @@ def read_json_object(path: Path, expected: str) -> dict[str, Any]:
             raise ValueError("no object")
         return found
     except FileNotFoundError as error:
-        raise FileError(f"{path} is missing; expected {expected}") from error
+        raise FileError(f"{path} does not exist; expected {expected}") from error
     except (OSError, ValueError) as error:
         raise FileError(f"{path}: expected {expected}, got something else ({error})") from error

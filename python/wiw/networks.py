@@ -27,7 +27,7 @@ def resolve_device(name: str | None) -> str:
     try:
         asked = torch.device(name)
     except RuntimeError as error:
-        raise ArgumentError(f"device: expected one of torch, such as cpu, cuda or cuda:1, got '{name}'") from error
+        raise ArgumentError(f"device: expected a torch device, such as cpu, cuda or cuda:1, got '{name}'") from error
     if asked.type == "cuda" and not 0 <= (asked.index or 0) < torch.cuda.device_count():
         raise ArgumentError(
             f"device: torch sees {torch.cuda.device_count()} CUDA devices, so there is no '{name}'; check the driver "
@@ -52,7 +52,7 @@ def memory_guard(what: str, cures: str) -> Iterator[None]:
     """Turn out-of-memory errors into one that says how to use less memory.
 
     Raises:
-        DeviceMemoryError: there is no memory left.
+        DeviceMemoryError: the memory is exhausted.
     """
     import torch
 
@@ -85,30 +85,32 @@ def is_path(name: str) -> bool:
 
 
 def explain_hub_error(error: BaseException, name: str, revision: str | None) -> WeightsError:
-    """Return a `WeightsError` that tells the user what an error of the hub's client means."""
+    """Return a `WeightsError` that explains an error of the hub's client to the user."""
     from huggingface_hub import errors
 
     chain = list(_walk_causes(error))
 
-    def met(*kinds: type[BaseException]) -> bool:
+    def is_caused_by(*kinds: type[BaseException]) -> bool:
         return any(isinstance(link, kinds) for link in chain)
 
     by_hand = f"or download it elsewhere (hf download {name} --local-dir FOLDER) and give weights=FOLDER"
-    if met(errors.GatedRepoError):
+    if is_caused_by(errors.GatedRepoError):
         text = f"'{name}' is gated: accept its terms at https://huggingface.co/{name}, then `hf auth login`"
         return WeightsError(text, "gated")
-    if met(errors.RevisionNotFoundError):
+    if is_caused_by(errors.RevisionNotFoundError):
         text = f"'{name}' has no revision '{revision}'; https://huggingface.co/{name}/commits/main lists its commits"
         return WeightsError(text, "revision")
-    if met(errors.RepositoryNotFoundError):
+    if is_caused_by(errors.RepositoryNotFoundError):
         text = (
-            f"the hub has no repository '{name}', or it is private: check the name, or `hf auth login`; "
-            "weights= also takes a folder"
+            f"the hub has no repository '{name}', or it is private: check the name, or log in with `hf auth login`; "
+            "weights= also accepts a folder"
         )
         return WeightsError(text, "missing")
     unreachable = any(kind.__name__ in NETWORK_ERRORS for link in chain for kind in type(link).__mro__)
-    if unreachable or met(errors.OfflineModeIsEnabled, errors.LocalEntryNotFoundError):
-        text = f"'{name}' is not on this machine and the hub is out of reach: connect (unset HF_HUB_OFFLINE), {by_hand}"
+    if unreachable or is_caused_by(errors.OfflineModeIsEnabled, errors.LocalEntryNotFoundError):
+        text = (
+            f"'{name}' is not on this machine and the hub cannot be reached: connect (unset HF_HUB_OFFLINE), {by_hand}"
+        )
         return WeightsError(text, "network")
     return WeightsError(f"'{name}' cannot be downloaded: {error}; try again, {by_hand}")
 

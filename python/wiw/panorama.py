@@ -1,10 +1,10 @@
 # SPDX-License-Identifier: Apache-2.0
 """Equirectangular panoramas: perspective views, cube maps, turns, directions, sizes.
 
-Columns cover 360 degrees with the front in the middle and the right at growing columns; rows cover 180 degrees from
-straight up to straight down, whatever the aspect ratio; pixel centres lie at half integers. Images are arrays
-``[H, W]``, ``[H, W, C]`` or ``[B, H, W, C]`` of uint8, float32 or, for ids and with ``interpolation="nearest"`` only,
-uint32. A wrong shape, type or angle raises ``wiw.errors.ArgumentError``.
+Columns cover 360 degrees, with the front in the middle and the right at larger columns; rows cover 180 degrees from
+straight up to straight down, whatever the aspect ratio; pixel centres lie at half integers. Images are arrays ``[H,
+W]``, ``[H, W, C]`` or ``[B, H, W, C]`` of uint8, float32 or, for ids and with ``interpolation="nearest"`` only, uint32.
+A wrong shape, type or angle raises ``wiw.errors.ArgumentError``.
 """
 
 from __future__ import annotations
@@ -38,7 +38,7 @@ Convention = Literal["wiw", "py360convert"]
 
 
 def _batch(images: Image) -> tuple[Image, int]:
-    """Any accepted image array as [B, H, W, C], and its original number of axes."""
+    """Return any accepted image array as [B, H, W, C], and its original number of axes."""
     images = np.asarray(images)
     if images.ndim == 2:
         return images[None, :, :, None], 2
@@ -56,7 +56,7 @@ def _unbatch(images: Image, ndim: int) -> Image:
 
 
 def _reshape_view(out: Image, shape: tuple[int, ...]) -> Image:
-    """``out`` with the axes of size 1 that the caller left out; never a copy."""
+    """Return ``out`` with the axes of size 1 that the caller left out; never a copy."""
     if out.size != np.prod(shape) or not out.flags.c_contiguous:
         raise ArgumentError(f"out: expected a C-contiguous array of {shape}, got {list(out.shape)}")
     return out.reshape(shape)
@@ -66,7 +66,7 @@ class PerspectivePlan:
     """Perspective views of panoramas of one size; build it once, call it often.
 
     The look-up table is shared by all yaws that are whole columns (at W = 1024 every multiple of 22.5 degrees); other
-    yaws get their own, the latest 16 kept.
+    yaws get their own, of which the latest 16 are kept.
 
     Args:
         pano_size: (H, W) of the panoramas; W even.
@@ -107,10 +107,10 @@ class PerspectivePlan:
     ) -> Image:
         """Cut views out of ``panos``.
 
-        ``yaw_deg`` is positive to the left. One yaw gives ``[h, w, C]`` a panorama (with a leading B for a batch); a
+        ``yaw_deg`` is positive to the left. One yaw gives ``[h, w, C]`` per panorama (with a leading B for a batch); a
         sequence of Y yaws gives all views of each, ``[Y, h, w, C]`` or ``[B, Y, h, w, C]``. ``out``, a C-contiguous
-        array of the result's shape and type, is written to and returned; a loop that reuses one spares the pages of a
-        new array.
+        array of the result's shape and type, is written to and returned; reusing one in a loop saves the allocation of
+        a new array.
         """
         images, ndim = _batch(panos)
         yaws = np.asarray(yaw_deg, dtype=np.float64)
@@ -157,7 +157,7 @@ def to_perspective(
 
 
 def to_cubemap(pano: Image, face_size: int, interpolation: Interpolation = "bilinear") -> Image:
-    """Six faces ``[6, S, S, C]`` (``[B, 6, S, S, C]`` for a batch) of 90 degrees between pixel edges.
+    """Return six faces ``[6, S, S, C]`` (``[B, 6, S, S, C]`` for a batch) of 90 degrees between pixel edges.
 
     Order: front, right, back, left, up, down. Side faces are upright; the lower edge of ``up`` and the upper edge of
     ``down`` touch the front.
@@ -169,9 +169,9 @@ def to_cubemap(pano: Image, face_size: int, interpolation: Interpolation = "bili
 
 
 def from_cubemap(faces: Image, size: Size, interpolation: Interpolation = "bilinear") -> Image:
-    """Panorama of ``size`` (H, W) from faces ``[6, S, S]``, ``[6, S, S, C]`` or ``[B, 6, S, S, C]``.
+    """Return the panorama of ``size`` (H, W) from faces ``[6, S, S]``, ``[6, S, S, C]`` or ``[B, 6, S, S, C]``.
 
-    Inverse of :func:`to_cubemap`. Across the cube's edges texels of both faces are blended, without a seam.
+    Inverse of :func:`to_cubemap`. Texels of both faces are blended across the cube's edges, without a seam.
     """
     faces = np.asarray(faces)
     ndim = faces.ndim - 1
@@ -189,7 +189,8 @@ def from_cubemap(faces: Image, size: Size, interpolation: Interpolation = "bilin
 def rotate(pano: Image, yaw_deg: float, interpolation: Interpolation = "bilinear") -> Image:
     """Return the view after a turn to the left by ``yaw_deg``: 22.5 degrees roll the image by exactly +W/16 columns.
 
-    Whole columns are copied whatever the type; other yaws blend neighbouring columns (uint32: only ``"nearest"``).
+    Turns by whole columns copy them, whatever the type; other yaws blend neighbouring columns (uint32: only
+    ``"nearest"``).
     """
     images, ndim = _batch(pano)
     return _unbatch(_core.rotate(images, float(yaw_deg), interpolation), ndim)
@@ -219,7 +220,7 @@ def _ray_lengths(size: Size, hfov_deg: float) -> NDArray[np.float32]:
 
 
 def distance_to_planar(distance: NDArray[np.float32], hfov_deg: float) -> NDArray[np.float32]:
-    """Return planar depth (along the optical axis) of perspective views ``[..., h, w]`` of distances along the ray.
+    """Convert distances along the ray in perspective views ``[..., h, w]`` to planar depth (along the optical axis).
 
     A view cut out of a panorama's depth holds distances; perspective cameras report planar depth. Both in metres; 0,
     where nothing is hit, stays 0.
@@ -228,5 +229,5 @@ def distance_to_planar(distance: NDArray[np.float32], hfov_deg: float) -> NDArra
 
 
 def planar_to_distance(planar: NDArray[np.float32], hfov_deg: float) -> NDArray[np.float32]:
-    """Inverse of :func:`distance_to_planar`."""
+    """Convert planar depth to distance along the ray: the inverse of :func:`distance_to_planar`."""
     return planar * _ray_lengths((planar.shape[-2], planar.shape[-1]), float(hfov_deg))

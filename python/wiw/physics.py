@@ -1,12 +1,12 @@
 # SPDX-License-Identifier: Apache-2.0
 """Rigid bodies and robots: simulation, kinematics, grasping.
 
-Bullet at a fixed 240 Hz; metres, kilograms, seconds, radians, and **z up**, the frame of robots. Poses are float64
-[4, 4] (`T_world_body`), batches [N, 4, 4]. A world is deterministic to the last bit, whatever the threads:
-`World.fork` and `World.restore` go on exactly as the original does.
+Bullet at a fixed 240 Hz; metres, kilograms, seconds, radians, and **z up**, the frame of robots. Poses are float64 [4,
+4] (`T_world_body`), batches [N, 4, 4]. A world is deterministic to the last bit, whatever the threads: `World.fork` and
+`World.restore` continue exactly as the original does.
 
-Hollow things are lists of convex parts. Parts of two things that are near each other are compared pair by pair: two
-cups of 6 wall segments each, one in the other, take 7000 steps a second, of 12 segments 2900.
+Hollow things are lists of convex parts. Parts of two nearby things are compared pair by pair: two cups of 6 wall
+segments each, one inside the other, run at 7000 steps per second; of 12 segments, at 2900.
 
     world = World()
     world.add_body(Box([1, 1, 0.1]), T_world_body=place(z=-0.05))      # a table, static
@@ -71,12 +71,12 @@ PANDA_TCP = "panda_hand_tcp"
 """The link between the Panda's finger tips: z points out of the hand, the fingers move along y."""
 
 PANDA_READY = np.array([0, -np.pi / 4, 0, -3 * np.pi / 4, 0, np.pi / 2, np.pi / 4, 0.04, 0.04])
-"""Joint positions [9] of the Panda's usual start: hand down in front of the base, fingers open."""
+"""Joint positions [9] of the Panda's usual starting pose: hand down in front of the base, fingers open."""
 
 
 @cache
 def panda() -> Articulation:
-    """Return the Franka Panda with its hand, of simple shapes (`configs/robots/panda.urdf`): 7 joints and 2 fingers."""
+    """Return the Franka Panda with its hand, in simple shapes (`configs/robots/panda.urdf`): 7 joints and 2 fingers."""
     return Articulation(Path(__file__).parent / "configs" / "robots" / "panda.urdf")
 
 

@@ -32,7 +32,7 @@ def end_with_parent(parent: int) -> None:
 
 
 def limit_time(seconds: float) -> None:
-    """End this process after so many seconds, or so many on all processors together."""
+    """End this process after some seconds of wall-clock time, or of time on all processors together."""
     signal.signal(signal.SIGALRM, signal.SIG_DFL)
     signal.alarm(max(1, math.ceil(seconds)))
     _, hard = resource.getrlimit(resource.RLIMIT_CPU)
@@ -53,7 +53,7 @@ def find_memory_limit() -> int:
 def limit_memory() -> int:
     """Let this process take three quarters of the machine's or the container's memory; return that in bytes.
 
-    The kernel counts each process by itself: those that this one starts may take as much each.
+    The kernel counts each process separately: each one that this process starts may take as much again.
     """
     most = find_memory_limit()
     _, hard = resource.getrlimit(resource.RLIMIT_DATA)

@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Work on a Ray cluster, or on one of this machine alone: connecting to it, tasks, and batches for pools of actors.
+"""Run work on a Ray cluster, possibly of this machine alone: connections, tasks, and batches for pools of actors.
 
-What is sent and returned are plain values; nothing of Ray's gets into results. Ray is imported when it is asked for.
+Only plain values are sent and returned; Ray does not influence results. Ray is imported only when needed.
 """
 
 from __future__ import annotations
@@ -22,26 +22,27 @@ from wiw.errors import ArgumentError, DependencyError, Error, InfrastructureErro
 
 Item = TypeVar("Item")
 STORE_BYTES = 200_000_000
-"""Memory of a local cluster's object store: messages are small, and containers often have 64 MB of shared memory."""
+"""Size of a local cluster's object store in bytes: messages are small, and containers often have 64 MB of shared
+memory."""
 RETRIES = 2
-"""How often a task is repeated whose process or node is lost."""
+"""Maximum number of repetitions of a task whose process or node is lost."""
 FAILED = "wiw error"
-"""Column of an answer of Ray Data that is an error: the name of its class; "text" is what it says."""
+"""Column of a Ray Data result that is an error: the name of its class; "text" is the message."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class Engine:
-    """The processes that do a job's work, and their place."""
+    """The processes that do a job's work, and where they run."""
 
     engine: Literal["processes", "ray"] = "processes"
-    """processes of this machine, or ray: actors of a Ray cluster, of which --workers is the number."""
+    """processes (on this machine) or ray (actors of a Ray cluster); --workers is their number."""
     address: Annotated[str | None, arg(metavar="ADDRESS")] = None
-    """Ray cluster, such as auto or HOST:6379; one of this machine alone if not given."""
+    """Ray cluster, such as auto or HOST:6379. Default: a local one on this machine."""
     worker_gpus: Annotated[float, arg(metavar="N")] = 0
-    """GPUs of an actor of Ray."""
+    """GPUs per Ray actor."""
 
     def require_valid(self, what: str) -> None:
-        """Check the numbers, and that what Ray alone has is asked of Ray; `what` is the command.
+        """Check the numbers, and that Ray's options are only given with Ray; `what` is the command.
 
         Raises:
             ArgumentError: an address or GPUs without Ray, or a number below 0.
@@ -49,11 +50,11 @@ class Engine:
         if self.worker_gpus < 0:
             raise ArgumentError(f"{what}: expected worker_gpus of at least 0, got {self.worker_gpus}")
         if self.engine != "ray" and (self.address is not None or self.worker_gpus):
-            raise ArgumentError(f"{what}: address and worker_gpus are for engine ray: give --engine ray (engine=)")
+            raise ArgumentError(f"{what}: address and worker_gpus require engine ray: give --engine ray (engine=)")
 
 
 HERE = Engine()
-"""Processes of this machine."""
+"""Processes on this machine."""
 
 
 def import_ray() -> Any:
@@ -75,7 +76,7 @@ def connect_cluster(address: str | None) -> Iterator[Any]:
 
     Raises:
         DependencyError: ray is not installed.
-        InfrastructureError: there is no cluster at the address.
+        InfrastructureError: no cluster at the address.
     """
     ray = import_ray()
     if ray.is_initialized():
@@ -91,8 +92,8 @@ def connect_cluster(address: str | None) -> Iterator[Any]:
         ray.init(**own, log_to_driver=False, logging_level="error")
     except (ConnectionError, ValueError, RuntimeError, OSError) as error:
         raise InfrastructureError(
-            f"no Ray cluster at {address or 'this machine'}: {error}; expected an address of "
-            "`ray start --head`, such as auto or HOST:6379, or none for a cluster of this machine alone"
+            f"no Ray cluster at {address or 'this machine'}: {error}; expected the address of a cluster started with "
+            "`ray start --head`, such as auto or HOST:6379, or none for a local cluster on this machine"
         ) from error
     try:
         _restore(handler)
@@ -105,7 +106,7 @@ def connect_cluster(address: str | None) -> Iterator[Any]:
 def run_tasks(
     place: Engine, function: Callable[[Item], Any], items: Sequence[Item], workers: int
 ) -> Iterator[tuple[Item, Any]]:
-    """Call a function on each item as tasks of Ray, at most `workers` at a time; yield items and results as they come.
+    """Call a function on items as Ray tasks, at most `workers` at a time; yield items and results as they arrive.
 
     A task whose process or node is lost is repeated. Tasks run in this process's folder, so that relative paths hold.
 
@@ -136,7 +137,7 @@ def map_batches(
     workers: int,
     batch: int,
 ) -> Iterator[dict[str, Any]]:
-    """Give rows to a pool of actors, a batch at a time, by Ray Data; yield rows of their answers as they come.
+    """Give rows to a pool of actors, a batch at a time, by Ray Data; yield rows of their answers as they arrive.
 
     Args:
         place: where.
@@ -157,7 +158,7 @@ def map_batches(
         logging.getLogger("ray.data").setLevel(logging.ERROR)
         pool = ray_data.ActorPoolStrategy(size=workers)
         found = ray_data.from_items([dict(row) for row in rows], override_num_blocks=workers).map_batches(
-            _Called,
+            _ActorObject,
             fn_constructor_kwargs={"kind": kind, "arguments": dict(arguments), "folder": str(Path.cwd())},
             batch_size=batch,
             compute=pool,
@@ -173,7 +174,7 @@ def map_batches(
             raise _find_cause(error) from error
 
 
-class _Called:
+class _ActorObject:
     """An object in an actor of Ray Data, in the folder of whoever asks it."""
 
     def __init__(self, kind: type, arguments: Mapping[str, Any], folder: str) -> None:
@@ -211,7 +212,7 @@ def _find_cause(error: Any) -> Exception:
             return found
         found = cause if isinstance(cause, BaseException) else None
     text = str(error).strip()
-    return InfrastructureError(f"work on the Ray cluster was lost: {text}; run the same again, with fewer workers")
+    return InfrastructureError(f"work on the Ray cluster was lost: {text}; repeat the command with fewer workers")
 
 
 def _remake_error(name: str, text: str) -> Error:

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""One small registry: world models, policies and so on are found by name, by entry point, or by path.
+"""A small registry that finds world models, policies and so on by name, by entry point, or by path.
 
 wiw.world_model("warp")                  python/wiw/world_models/warp.py  (its class is named in `WORLD_MODELS`)
 wiw.world_model("remote:ws://HOST:1234") what follows the name is its first argument, for those that end with a colon
@@ -33,20 +33,20 @@ class Registry:
     """The names of one kind of part. Modules are imported on first use, so that `import wiw` stays light."""
 
     kind: str
-    """As in messages: "world model"."""
+    """The kind as named in messages: "world model"."""
     group: str
-    """Entry-point group; empty where packages add none."""
+    """Entry-point group; empty if packages add none."""
     built_in: dict[str, str]
-    """Name to `module:attribute`. A name that ends with a colon takes what is written after it as first argument."""
+    """Name to `module:attribute`. For a name that ends with a colon, what follows it is the first argument."""
     base: str = ""
-    """`module:class` that things of this kind derive from, if they have to."""
+    """`module:class` that parts of this kind must derive from, if any."""
     registered: dict[str, Any] = field(default_factory=dict)
-    """Things that programs have added under names of their own (`register`)."""
+    """Parts that programs have added under their own names (`register`)."""
     door: str = ""
-    """`module:function` that returns what stands for a part of somebody else's, given its name, so that its code is
-    imported and run in a process of its own; empty where such parts are run in this one."""
+    """`module:function` that returns a proxy for an external part, given its name, so that its code is imported and run
+    in a separate process; empty if external parts run in this one."""
     prefix: str = ""
-    """Beginning of the names that go through the door; empty where those of all parts of somebody else's do."""
+    """Prefix of the names that go through the door; empty if all external parts do."""
 
     def names(self) -> list[str]:
         """Return all registered names, built-in ones first."""
@@ -59,22 +59,22 @@ class Registry:
             RegistryError: the name is taken, or the class is of another kind.
         """
         if name in self.names():
-            raise RegistryError(f"the {self.kind} '{name}' is there already; choose another name")
+            raise RegistryError(f"the {self.kind} '{name}' already exists; choose another name")
         self.registered[name] = self._check_kind(name, thing)
 
     def find(self, name: str) -> Any:
         """Return the class or factory behind a name or path.
 
         Raises:
-            RegistryError: unknown name; missing file, module or attribute; an exception while it was imported (the
-                cause); a class of another kind.
+            RegistryError: unknown name; missing file, module or attribute; an exception during import (the cause); a
+                class of another kind.
         """
         if self.door and (name.startswith(self.prefix) if self.prefix else self.is_foreign(name)):
             return _attribute(self.door)(name.removeprefix(self.prefix))
         return self.find_here(name)
 
     def is_foreign(self, name: str) -> bool:
-        """Return whether a name stands for code in a file or package that does not ship with wiw."""
+        """Return whether a name refers to code in a file or package that does not ship with wiw."""
         if name in self.registered or name in self.built_in or name.partition(":")[0] + ":" in self.built_in:
             return False
         plugins = self._list_plugins()
@@ -96,7 +96,7 @@ class Registry:
         if colon:
             return self._load(name, partial(_attribute, name))
         hint = (
-            f" A file defines several things: name one of its classes, as {name}:CLASS."
+            f" To use a file, name one of its classes: {name}:CLASS."
             if name.endswith(".py")
             else did_you_mean(name, self.names())
         )
@@ -107,16 +107,16 @@ class Registry:
         )
 
     def make(self, what: Any, **options: Any) -> Any:
-        """Return an instance from a name, path, class, factory, or instance (returned as it is).
+        """Return an instance from a name, path, class, factory, or instance (returned unchanged).
 
         Raises:
             RegistryError: see `find`; also when the options do not fit the constructor.
-            ConstructionError: the constructor raised something else than an error of wiw (the cause).
+            ConstructionError: the constructor raised an exception that is not an error of wiw (the cause).
         """
         return self._make(what, self.fitting(what, **options), options)
 
     def make_here(self, what: Any, **options: Any) -> Any:
-        """Return an instance as `make` does, whose code runs in this process."""
+        """Return an instance like `make`, whose code runs in this process."""
         found = self.find_here(what) if isinstance(what, str) else what
         return self._make(what, self._require_fitting(what, found, options), options)
 
@@ -124,7 +124,7 @@ class Registry:
         """Return what `make` would call with these options, or the instance that it would return.
 
         Raises:
-            RegistryError: as of `make`, but for what shows only as it is made.
+            RegistryError: like `make`, except for what only construction reveals.
         """
         return self._require_fitting(what, self.find(what) if isinstance(what, str) else what, options)
 
@@ -149,7 +149,7 @@ class Registry:
                 raise
             name = what if isinstance(what, str) else getattr(what, "__qualname__", repr(what))
             raise ConstructionError(
-                f"{self.kind} '{name}' cannot be made: {type(error).__name__}: {error}{_locate_error(error)}"
+                f"{self.kind} '{name}' cannot be built: {type(error).__name__}: {error}{_locate_error(error)}"
             ) from error
 
     def _list_plugins(self) -> dict[str, Any]:
@@ -174,11 +174,13 @@ class Registry:
         base = getattr(importlib.import_module(module), attribute)
         if issubclass(thing, base) if inspect.isclass(thing) else isinstance(thing, base):
             return thing
-        raise RegistryError(f"'{name}' is no {self.kind}: expected a class derived from wiw.{attribute}, got {thing!r}")
+        raise RegistryError(
+            f"'{name}' is not a {self.kind}: expected a class derived from wiw.{attribute}, got {thing!r}"
+        )
 
 
 def _makes(thing: Any) -> bool:
-    """Return whether it is a class or a factory, rather than an instance."""
+    """Return whether a thing is a class or a factory, rather than an instance."""
     return inspect.isclass(thing) or inspect.isfunction(thing) or isinstance(thing, partial)
 
 
@@ -197,7 +199,7 @@ def _attribute(path: str) -> Any:
 def _import_file(path: Path) -> Any:
     """Return the module in a Python file; an edited file is imported again.
 
-    Its folder is put first on the path, as for a script, so that it finds the modules beside it.
+    Its folder is put first on the path, as for a script, so that it finds the modules next to it.
     """
     path = path.expanduser().resolve()
     if not path.is_file():
@@ -221,7 +223,7 @@ def _import_file(path: Path) -> Any:
 
 
 def _locate_error(error: BaseException) -> str:
-    """Return, e.g., " (model.py, line 3)": where an import failed, as the message alone may not say."""
+    """Return, e.g., " (model.py, line 3)": where an import failed, which the message alone may not say."""
     place = None if isinstance(error, SyntaxError | FileNotFoundError | AttributeError) else find_raising_line(error)
     return "" if place is None else f" ({Path(place.filename).name}, line {place.lineno})"
 
@@ -261,23 +263,23 @@ WORLD_MODELS = Registry(
     door="wiw.isolation.models:find_isolated_model",
 )
 ISOLATED = "isolated:"
-"""Beginning of the name of a policy that is to run in a process of its own."""
+"""Prefix of the name of a policy that is to run in a separate process."""
 FUNCTION = "wiw.world_models.function:Function"
-"""Class that makes a world model of a function."""
+"""Class that turns a function into a world model."""
 POLICIES = Registry(
     "policy",
     "wiw.policies",
     {
         "heuristic": "wiw.policies.heuristic:Heuristic",
-        "matcher": "wiw.policies.matcher:Matcher",
+        "matcher": "wiw.policies.matcher.policy:Matcher",
         "climber": "wiw.policies.matcher.climber:Climber",
         "geometric": "wiw.policies.geometric:Geometric",
-        "navigator": "wiw.policies.navigator:Navigator",
-        "recogniser": "wiw.policies.recogniser:Recognition",
+        "navigator": "wiw.policies.navigator.policy:Navigator",
+        "recogniser": "wiw.policies.recogniser.policy:Recognition",
         "vlm": "wiw.policies.vlm.make:make_vlm",
         "scripted": "wiw.policies.scripted:Scripted",
         "diffuser": "wiw.policies.diffuser:Diffuser",
-        "explorer": "wiw.policies.explorer:Explorer",
+        "explorer": "wiw.policies.explorer.policy:Explorer",
         "explorer-oracle": "wiw.experiments.privileged_explorers:OracleExplorer",
         "explorer-tour": "wiw.experiments.privileged_explorers:TourExplorer",
         "explorer-oracle-tour": "wiw.experiments.privileged_explorers:OracleTourExplorer",
@@ -390,11 +392,11 @@ def list_metrics() -> list[str]:
 def world_model(name: Any, **options: Any) -> Any:
     """Return a world model by name, `path.py:Class`, class or instance; None for "none".
 
-    `wiw.world_model(function, accepts=wiw.accepts(...))` makes one of a function that is called as
-    `WorldModel.rollout` is.
+    `wiw.world_model(function, accepts=wiw.accepts(...))` turns a function that is called like `WorldModel.rollout` into
+    one.
 
     Raises:
-        RegistryError: unknown name, or options that do not fit; the message says what is known.
+        RegistryError: unknown name, or options that do not fit; the message lists the known ones.
     """
     if "accepts" in options and not isinstance(name, str) and not inspect.isclass(name):
         return _attribute(FUNCTION)(name, **options)
@@ -405,7 +407,7 @@ def policy(name: Any, **options: Any) -> Any:
     """Return a policy by name, `path.py:Class`, class or instance.
 
     Raises:
-        RegistryError: unknown name, or options that do not fit; the message says what is known.
+        RegistryError: unknown name, or options that do not fit; the message lists the known ones.
     """
     return POLICIES.make(name, **options)
 
@@ -413,11 +415,11 @@ def policy(name: Any, **options: Any) -> Any:
 def make(task_id: str, depth: bool = True, **options: Any) -> Any:
     """Return a gymnasium environment of a task, e.g. `wiw.make("ImageNav-v0", scenes="apartments:val", seed=0)`.
 
-    Observations carry depth unless `depth=False`: the matcher maps with it and `warp` imagines with it. What else an
-    environment of the task can be given to observe may be among the options (`cameras`, ... of `Manipulation-v0`).
+    Observations carry depth unless `depth=False`: the matcher maps with it and `warp` imagines with it. Other things to
+    observe may be among the task's options (such as `cameras` for `Manipulation-v0`).
 
     Raises:
-        RegistryError: unknown task, or options that do not fit; the message says what is known.
+        RegistryError: unknown task, or options that do not fit; the message lists the known ones.
     """
     task, own = _make_task(task_id, options)
     return task.environment(depth=depth, **own)
@@ -427,7 +429,7 @@ def make_vec(task_id: str, num_envs: int, depth: bool = True, **options: Any) ->
     """Return a gymnasium vector environment of a task: `num_envs` episodes, stepped and observed as a batch.
 
     Raises:
-        RegistryError: unknown task, or options that do not fit; the message says what is known.
+        RegistryError: unknown task, or options that do not fit; the message lists the known ones.
         ArgumentError: `num_envs` below 1.
     """
     task, own = _make_task(task_id, options)
@@ -443,11 +445,13 @@ def _make_task(task_id: str, options: dict[str, Any]) -> tuple[Any, dict[str, An
 
 
 def task_class(name: str) -> Any:
-    """Return the class behind a task's name; `wiw.Task` for a factory, which says nothing before it is called."""
+    """Return the class behind a task's name; `wiw.Task` for a factory, whose class is unknown before it is called."""
     found = TASKS.find(name)
     return found if inspect.isclass(found) else _attribute(TASKS.base)
 
 
 def task_name(task_id: str) -> str:
-    """Return the registered name of a gymnasium id: "imagenav" for "ImageNav-v0". Other names and paths stay."""
+    """Return the registered name of a gymnasium id: "imagenav" for "ImageNav-v0". Other names and paths are
+    unchanged.
+    """
     return task_id if ":" in task_id or task_id in TASKS.names() else task_id.removesuffix("-v0").lower()

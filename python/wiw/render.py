@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Pictures of a scene: colour, metric depth and instance ids, perspective or panoramic, a batch of poses a call."""
+"""Render a scene: colour, metric depth and instance ids, perspective or panoramic, a batch of poses per call."""
 
 from __future__ import annotations
 
@@ -21,16 +21,16 @@ _DTYPES = {"color": np.uint8, "depth": np.float32, "instance": np.uint32}
 
 
 class Renderer:
-    """Draws one scene.
+    """Renders one scene.
 
-    `backend` is "cpu" (ray caster), "gpu" (EGL/OpenGL) or "auto": the GPU where a hardware device exists, else the CPU.
-    `samples` (1, 4, 9 or 16) colour samples a pixel smooth edges; depth and ids always come from the pixel's centre.
-    Both sides of every triangle are drawn. Raises `BackendError` when the back end cannot run here and `ArgumentError`
-    for a scene without triangles.
+    `backend` is "cpu" (ray caster), "gpu" (EGL/OpenGL) or "auto": the GPU if there is a hardware device, otherwise the
+    CPU. `samples` (1, 4, 9 or 16) colour samples per pixel smooth edges; depth and ids always come from the pixel's
+    centre. Both sides of every triangle are drawn. Raises `BackendError` if the backend cannot run here, and
+    `ArgumentError` for a scene without triangles.
 
-    Every picture is a dict with the asked outputs:
-    "color" uint8 [B, H, W, 3]; "depth" float32 [B, H, W] in metres, planar z for perspective and distance along the
-    ray for panoramas, 0 where nothing is hit; "instance" uint32 [B, H, W] ids of `scene.instances`, 0 for nothing.
+    Every method returns a dict with the requested outputs: "color" uint8 [B, H, W, 3]; "depth" float32 [B, H, W] in
+    metres, planar z for perspective and distance along the ray for panoramas, 0 where nothing is hit; "instance" uint32
+    [B, H, W] ids of `scene.instances`, 0 for nothing.
     """
 
     def __init__(self, scene: Any, backend: Literal["auto", "cpu", "gpu"] = "auto", samples: int = 1) -> None:
@@ -44,7 +44,7 @@ class Renderer:
 
     @property
     def description(self) -> str:
-        """The back end in words, e.g. "cpu (Embree 3.13.5, avx512)"."""
+        """The backend in words, e.g. "cpu (Embree 3.13.5, avx512)"."""
         return self._renderer.description
 
     def perspective(
@@ -81,7 +81,7 @@ class Renderer:
         return pictures
 
     def set_poses(self, instance_ids: ArrayLike, T_world_instance: ArrayLike) -> None:
-        """Move instances; the others stay where they are. Ids [N], transforms float [N, 4, 4]."""
+        """Move instances to new poses, leaving the others unchanged. Ids [N], transforms float [N, 4, 4]."""
         ids = np.asarray(instance_ids)
         if ids.size and (not np.issubdtype(ids.dtype, np.integer) or ids.min() < 0 or ids.max() > 0xFFFFFFFF):
             raise ArgumentError(f"expected instance_ids as unsigned integers [N], got {ids.dtype} {list(ids.shape)}")
@@ -90,7 +90,7 @@ class Renderer:
 
 @cache
 def resolve_backend(backend: Literal["auto", "cpu", "gpu"]) -> Literal["cpu", "gpu"]:
-    """Return the back end that "auto" stands for on this machine; the others as they are."""
+    """Return the backend that "auto" stands for on this machine; others unchanged."""
     if backend != "auto":
         return backend
     triangle = Scene.from_arrays([{"positions": np.eye(3, dtype=np.float32), "triangles": np.array([[0, 1, 2]])}])

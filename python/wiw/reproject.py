@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Reprojection of RGB-D images to other camera poses: what a moving camera would see of what is already known.
+"""Reproject RGB-D images to other camera poses: what a moving camera would see of what is already known.
 
 A source is a panorama (depth is the distance along the ray) or, with a field of view given, a perspective view (depth
 is planar z). Depth is in metres, 0 where nothing is hit. A wrong shape, size or transform raises
@@ -27,7 +27,9 @@ def _warp(source: Size, source_hfov: float | None, target: Size, target_hfov: fl
 
 
 def pose(forward: float = 0.0, left: float = 0.0, up: float = 0.0, yaw_deg: float = 0.0) -> NDArray[np.float64]:
-    """Pose [4, 4] of a camera moved in the frame of another: metres, and a turn to the left after the move."""
+    """Return the pose [4, 4] of a camera moved in the frame of another: metres, and a turn to the left after the
+    move.
+    """
     yaw = np.radians(yaw_deg)
     cos, sin = np.cos(yaw), np.sin(yaw)
     return np.array([[cos, 0, sin, -left], [0, 1, 0, up], [-sin, 0, cos, -forward], [0, 0, 0, 1.0]])
@@ -44,11 +46,11 @@ def warp(
     outputs: tuple[str, ...] = ("color",),
     cut: float = 0.1,
 ) -> Any:
-    """Show B images from T poses each.
+    """Warp B images to T poses each.
 
-    A mesh through the depth of every source is drawn from the new pose; each pixel takes its colour from the source in
-    one bilinear look-up. What the source did not see, or saw only from the other side, is a hole: its colour is a mean
-    of what lies around it, the farther the heavier; its depth is the background's beside it.
+    A mesh through the depth of each source is rendered from the new pose; each pixel takes its colour from the source
+    in one bilinear look-up. What the source did not see, or saw only from the other side, is a hole: its colour is a
+    mean of its surroundings in which farther ones weigh more; its depth is that of the background next to it.
 
     Args:
         color: uint8 [B, H, W, 3].
@@ -56,8 +58,8 @@ def warp(
         T_source_target: [B, T, 4, 4], pose of each new camera in the frame of its source (see :func:`pose`).
         hfov_deg: None for panoramas; for perspective views their horizontal field of view between pixel edges.
         size: (h, w) of the results; None means the source's.
-        target_hfov_deg: field of view of the results where it differs from the source's: perspective views of a
-            panorama come straight from its depth mesh this way.
+        target_hfov_deg: field of view of the results, if it differs from the source's; this renders perspective views
+            of a panorama directly from its depth mesh.
         outputs: any of "color" (uint8 [B, T, h, w, 3]), "depth" (float32 [B, T, h, w], as in the source's kind of
             image, guesses included) and "hole" (bool [B, T, h, w], True where colour and depth are guessed).
         cut: the mesh is cut where neighbouring depths differ by more than this fraction and no plane explains it.

@@ -38,7 +38,7 @@ def read_values(declared: type, values: Mapping[str, Any], where: str, noun: str
         noun: for a name among them, such as "option".
 
     Raises:
-        ArgumentError: a name that is no field, or a value of another type; says where, and what is expected.
+        ArgumentError: a name that is not a field, or a value of another type; says where, and what is expected.
     """
     require_known(values, [field.name for field in fields(declared)], where, noun)
     kinds = get_type_hints(declared)
@@ -55,7 +55,7 @@ def require_known(names: Iterable[Any], known: Collection[str], where: str, noun
     if unknown:
         there = ", ".join(known) or "none"
         hint = did_you_mean(unknown[0], list(known))
-        raise ArgumentError(f"{where}: unknown {noun} '{unknown[0]}'; there are {there}.{hint}")
+        raise ArgumentError(f"{where}: unknown {noun} '{unknown[0]}'; expected one of {there}.{hint}")
 
 
 def _read_value(value: Any, kind: Any, where: str) -> Any:

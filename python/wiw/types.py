@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The values that travel through the closed loop. All are frozen; arrays follow `docs/conventions.md`."""
+"""Values that travel through the closed loop. All are frozen; arrays follow `docs/conventions.md`."""
 
 from __future__ import annotations
 
@@ -22,22 +22,24 @@ GRIPPER_POSES: Final = "pose7"
 
 @dataclass(frozen=True)
 class Key:
-    """Names one decision for all randomness: results are functions of it, never of batch size or worker count."""
+    """Identifies one decision; all randomness is derived from it, so results never depend on batch size or worker
+    count.
+    """
 
     seed: int
     episode: int
     decision: int = 0
 
     def at(self, decision: int) -> Key:
-        """Return the key of another decision of the same episode."""
+        """Return the key of another decision in the same episode."""
         return Key(self.seed, self.episode, decision)
 
 
 def check_seed(seed: Any) -> int:
-    """Return a seed as it is, once it is checked.
+    """Check a seed and return it.
 
     Raises:
-        ArgumentError: it is no whole number from 0 to 2**64 - 1.
+        ArgumentError: it is not a whole number from 0 to 2**64 - 1.
     """
     if not isinstance(seed, int | np.integer) or not 0 <= seed < 2**64:
         raise ArgumentError(f"seed: expected a whole number from 0 to 2**64 - 1, got {seed!r}")
@@ -45,19 +47,20 @@ def check_seed(seed: Any) -> int:
 
 
 Box = tuple[float, float, float, float]
-"""Left, top, right, bottom in pixels, 0 at the left (upper) edge of the first pixel; left > right: across the seam."""
+"""Left, top, right, bottom in pixels, 0 at the left (upper) edge of the first pixel; left > right if it crosses the
+seam."""
 
 
 @dataclass(frozen=True)
 class Target:
-    """The one thing in view that a task is about, as a red box would point it out; nothing says what it is."""
+    """The one object in view that a task is about, marked as by a red box, without saying what it is."""
 
     mask: NDArray[np.bool_]
     """bool [576, 1024]: its visible pixels in the panorama."""
     panorama_box: Box | None
-    """Around the mask; None where nothing of it is visible."""
+    """Box around the mask; None if no part is visible."""
     front_box: Box | None
-    """Around its visible pixels in the front view."""
+    """Box around its visible pixels in the front view."""
 
 
 @dataclass(frozen=True)
@@ -68,8 +71,8 @@ class Answer:
     probabilities: NDArray[np.float64]
     """float64 [len(choices)], sum 1."""
     raw: NDArray[np.float64] | None = None
-    """float64 [len(choices)], sum at most 1: the probabilities as a language model gave them, before they were made to
-    sum to 1; None where nothing was left out."""
+    """float64 [len(choices)], sum at most 1: the probabilities a language model gave, before normalisation; None if
+    they summed to 1."""
 
     @property
     def label(self) -> str:
@@ -78,25 +81,25 @@ class Answer:
 
     @property
     def confidence(self) -> float:
-        """Its probability, the raw one where it is known: what is left out counts against an answer."""
+        """Its probability, the raw one if known, so that probability outside the choices counts against an answer."""
         given = self.probabilities if self.raw is None else self.raw
         return float(given[int(np.argmax(self.probabilities))])
 
 
 @dataclass(frozen=True)
 class TextAnswer:
-    """An agent's belief at a decision, in words, where the goal is a question."""
+    """What an agent believes at a decision, in words, if the goal is a question."""
 
     text: str = ""
     """Empty while the agent believes nothing."""
     confidence: float = 0.0
     """From 0 to 1."""
     final: bool = False
-    """Whether the agent gives this as its answer; the task's rules say when that ends the episode."""
+    """Whether the agent commits to this as its answer; the task's rules say when that ends the episode."""
 
 
 class Outlook(Protocol):
-    """The view from one place, to be drawn when somebody looks."""
+    """The view from one place, rendered on demand."""
 
     def draw(self, outputs: Sequence[str]) -> dict[str, NDArray[Any]]:
         """Return images by name: "panorama", "front", "depth"; see `Observation`."""
@@ -104,9 +107,9 @@ class Outlook(Protocol):
 
 @dataclass(frozen=True)
 class Observation:
-    """What the agent perceives: images, odometry since the episode's start, and depth where the run grants it.
+    """What the agent perceives: images, odometry since the start of the episode, and depth if the run grants it.
 
-    Nothing here tells where in the scene the agent is: poses are relative to the first observation of the episode.
+    Nothing here reveals where in the scene the agent is: poses are relative to the first observation of the episode.
     """
 
     panorama: NDArray[np.uint8]
@@ -116,20 +119,20 @@ class Observation:
     odometry: NDArray[np.float64]
     """float64 [3]: x forward and y left in metres, azimuth in radians (left positive), in the frame of the start."""
     depth: NDArray[np.float32] | None = field(default_factory=lambda: None)
-    """float32 [576, 1024] distance along the ray in metres, 0 where nothing is hit; None unless asked for."""
+    """float32 [576, 1024] distance along the ray in metres, 0 where nothing is hit; None unless requested."""
     target: Target | None = None
-    """Where the task points something out."""
+    """Set if the task marks an object."""
 
     @classmethod
     def from_outlook(
         cls, outlook: Outlook, odometry: NDArray[np.float64], images: Mapping[str, NDArray[Any]], depth: bool
     ) -> Observation:
-        """Return an observation whose images are drawn when they are first read, but for those that are given.
+        """Return an observation whose images are rendered when first read, except those given here.
 
         Args:
-            outlook: that draws them, of the place of the observation, wherever the agent goes.
+            outlook: renders them at the place of the observation, even after the agent has moved on.
             odometry: float64 [3].
-            images: by the names of fields.
+            images: by field name.
             depth: whether the observation has depth.
         """
         observation = object.__new__(cls)
@@ -139,7 +142,7 @@ class Observation:
         return observation
 
     def __getattr__(self, name: str) -> Any:
-        """Draw an image that has not been read before; the panorama and its depth are drawn at once."""
+        """Render an image on first access; the panorama and its depth are rendered together."""
         outlook = self.__dict__.get("_outlook")
         if outlook is None or name not in ("panorama", "front", "depth"):
             raise AttributeError(f"'{type(self).__name__}' object has no attribute '{name}'")
@@ -148,14 +151,14 @@ class Observation:
         return self.__dict__[name]
 
     def __getstate__(self) -> dict[str, Any]:
-        """Return all fields, drawn: what can be copied and sent elsewhere."""
+        """Return all fields, with images rendered, so that the observation can be copied and sent elsewhere."""
         return {one.name: getattr(self, one.name) for one in fields(self)}
 
     def as_dict(self) -> dict[str, Any]:
-        """Return the observation as gymnasium spaces see it; `depth` only where present.
+        """Return the observation as a dict for gymnasium spaces; `depth` only where present.
 
-        Where something is pointed out, its box is drawn in red on the images and given as "panorama_box" and
-        "front_box", float32 [4], all -1 where nothing of it is visible; the mask is left out.
+        If there is a target, its box is drawn in red on the images and given as "panorama_box" and "front_box", float32
+        [4], all -1 if no part is visible; the mask is left out.
         """
         values: dict[str, Any] = {"panorama": self.panorama, "front": self.front, "odometry": self.odometry}
         if self.depth is not None:
@@ -179,33 +182,36 @@ def _draw_boxes(observation: Observation, target: Target) -> dict[str, Any]:
 
 @dataclass(frozen=True)
 class CameraView:
-    """A view by a manipulator's camera other than the fixed front one."""
+    """A view from one of a manipulator's cameras other than the fixed front one."""
 
     image: NDArray[np.uint8]
     """uint8 [480, 480, 3]."""
     T_world_camera: NDArray[np.float64]
     """float64 [4, 4]: the camera looks along -z with +y up."""
     depth: NDArray[np.float32] | None = None
-    """float32 [480, 480] planar z in metres, 0 where nothing is hit; None unless asked for."""
+    """float32 [480, 480] planar z in metres, 0 where nothing is hit; None unless requested."""
 
 
 @dataclass(frozen=True)
 class ArmObservation:
-    """What a manipulator perceives; its goals are in words and its plans are poses."""
+    """What a manipulator perceives; its goals are given in words and its plans are poses."""
 
     front: NDArray[np.uint8]
     """uint8 [480, 480, 3]: the fixed camera in front of the table."""
     pose: NDArray[np.float64]
-    """float64 [7]: of the gripper, in the world's frame; `docs/conventions.md` has axes and units."""
+    """float64 [7]: the gripper's pose in the world frame; `docs/conventions.md` has axes and units."""
     depth: NDArray[np.float32] | None = None
-    """float32 [480, 480] planar z in metres of the front view, 0 where nothing is hit; None unless asked for."""
+    """float32 [480, 480] planar z of the front view in metres, 0 where nothing is hit; None unless requested."""
     places: Mapping[str, NDArray[np.float64]] = field(default_factory=dict)
-    """float64 [4, 4] by name: the objects' exact poses, which the paper gives policies that cannot see them so well."""
+    """float64 [4, 4] by name: the objects' exact poses, which the paper gives to policies that cannot see them
+    precisely."""
     wrist: CameraView | None = None
-    """The camera on the hand; None unless asked for."""
+    """The camera on the hand; None unless requested."""
 
     def as_dict(self) -> dict[str, Any]:
-        """Return the observation as gymnasium spaces see it; `depth`, `wrist` and `wrist_depth` only where present."""
+        """Return the observation as a dict for gymnasium spaces; `depth`, `wrist` and `wrist_depth` only where
+        present.
+        """
         wrist = self.wrist
         more = {
             "depth": self.depth,
@@ -225,49 +231,49 @@ class Goal:
     """uint8 [480, 480, 3], HFOV 90 degrees."""
     text: str | None = None
     choices: tuple[str, ...] = ()
-    """What an answer is chosen from, where the task asks for one."""
+    """The possible answers, if the task asks for a choice."""
     question: bool = False
-    """Whether `text` is a question that is answered in words (`TextAnswer`)."""
+    """Whether `text` is a question to be answered in words (`TextAnswer`)."""
 
     @property
     def expects_answer(self) -> bool:
-        """Whether the agent says at every decision what it believes."""
+        """Whether the agent must state its belief at every decision."""
         return self.question or bool(self.choices)
 
 
 @dataclass(frozen=True)
 class Wording:
-    """How reports and views speak of a task's episodes."""
+    """The words that reports and views use for a task's episodes."""
 
     succeeded: str = "succeeded"
     """What a successful episode did, e.g. "reached the goal"."""
     won: str = "succeeded"
-    """The same in a word, e.g. "reached"."""
+    """The same in one word, e.g. "reached"."""
     lost: str = "not succeeded"
-    """Any other episode, e.g. "not reached"."""
+    """The outcome of any other episode, e.g. "not reached"."""
     goal: str = "goal"
-    """What distances end at."""
+    """The point to which distances are measured."""
     way: str = "to the goal"
-    """Where an episode's shortest way leads."""
+    """The end of an episode's shortest path."""
     asked: str = "The goal"
-    """Over what the agent is shown, e.g. "The goal: find where this was taken"."""
+    """Caption of the goal, e.g. "The goal: find where this was taken"."""
     steps: str = "primitives"
-    """What the length of an episode counts."""
+    """Unit in which the length of an episode is counted."""
 
 
 @dataclass(frozen=True)
 class TableSpec:
-    """Contents of the tables and plots of a task's runs, beside the metrics of each arm."""
+    """What the tables and plots of a task's runs show, besides each arm's metrics."""
 
     kinds: tuple[str, ...] = ("success",)
-    """Metrics that are shown for each kind of episode, where there are several."""
+    """Metrics shown for each kind of episode, if there are several kinds."""
     judged: tuple[str, ...] = ()
     """Metrics that depend on a judge's marks."""
     cuts: tuple[int, ...] = ()
-    """Primitives at which the anytime curve is read, from the metrics "score_at_30" and so on; without any, it is that
-    of success over decisions."""
+    """Numbers of primitives at which the anytime curve is read, from metrics such as "score_at_30"; if empty, the curve
+    is success over decisions."""
     kind: str = "kind of task"
-    """Word for a kind."""
+    """What a kind is called."""
 
 
 @dataclass(frozen=True)
@@ -279,7 +285,7 @@ class Proposal:
     """The proposing policy's own preference; higher is better."""
     note: str = ""
     text: str = ""
-    """The plan in the policy's words, for world models that read text; only of plans made of poses."""
+    """The plan in the policy's words, for world models that read text; only for plans of poses."""
 
     def __post_init__(self) -> None:
         actions = np.asarray(self.actions)
@@ -289,31 +295,31 @@ class Proposal:
 
 @dataclass(frozen=True)
 class Control:
-    """One row of a world model's batch: the same plan in every form, of which the model reads what it declared.
+    """One row of a world model's batch: one plan in every form, of which the model reads the one it declared.
 
-    Frame 0 is the observation; frame k is what follows action k. Frames 1..`shared` of this row are answered by an
-    earlier row of the batch, or the policy reads only ends; they are never read, so a model that computes frames one by
-    one may leave them unwritten.
+    Frame 0 is the observation; frame k is what follows action k. Frames 1..`shared` of this row are never read, as an
+    earlier row of the batch has the same ones or the policy only reads the ends of plans; a model that computes frames
+    one by one may leave them unwritten.
     """
 
     actions: NDArray[np.int8]
-    """int8 [K] primitive ids, padded to the model's frames - 1; null tokens where the plan is made of poses."""
+    """int8 [K] primitive ids, padded to the model's frames - 1; null tokens if the plan consists of poses."""
     trajectory: NDArray[np.float64]
     """float64 [K, 3]: x forward, y left, azimuth, in the frame of frame 0."""
     viewpoints: NDArray[np.float64]
     """float64 [K, 4, 4]: T_start_camera after each action; start is the camera of frame 0."""
     text: str = ""
     ids: NDArray[np.generic] | None = None
-    """[K] or [K + 1] ids or vectors in the model's own vocabulary (else primitive ids), null token in front where it
-    needs one; float64 [K + 1, 7] gripper poses in space "pose7", that of frame 0 in front; None unless the model reads
-    actions."""
+    """[K] or [K + 1] ids or vectors in the model's own vocabulary (primitive ids by default), with a leading null token
+    if it needs one; in space "pose7", float64 [K + 1, 7] gripper poses, beginning with that of frame 0; None unless the
+    model reads actions."""
     length: int = 0
-    """Actions that are the agent's own; the rest is padding."""
+    """Number of actions in the agent's plan; the rest is padding."""
     shared: int = 0
 
     @staticmethod
     def of_poses(count: int, text: str = "", ids: NDArray[np.float64] | None = None) -> Control:
-        """Return a plan of `count` gripper poses, all the agent's own: in words, or as poses [count + 1, 7]."""
+        """Return a plan of `count` gripper poses without padding: in words, or as poses [count + 1, 7]."""
         actions = np.zeros(count, np.int8)  # null tokens are 0
         still = np.broadcast_to(np.eye(4), (count, 4, 4))
         return Control(actions, np.zeros((count, 3)), still, text, ids, length=count)
@@ -321,12 +327,12 @@ class Control:
 
 @dataclass(frozen=True)
 class History:
-    """Observations before each row's rollout begins: N frames, oldest first, of which the last is frame 0.
+    """The observations up to the start of each row's rollout: N frames, oldest first, the last being frame 0.
 
-    The frames are those of the decisions so far, as the agent observes once per decision, and so a varying number of
-    actions apart. Where a plan begins with turns, frame 0 is the present observation after them, and the present
-    observation itself is the frame before. Where a plan is longer than the model's rollout, each further call is shown
-    the latest frames of all, one action apart where they are imagined.
+    The agent observes once per decision, so the frames are those of the decisions so far and a varying number of
+    actions apart. If a plan begins with turns, frame 0 is the present observation after these turns, and the frame
+    before it is the present observation itself. If a plan is longer than the model's rollout, each further call gets
+    the latest frames, including imagined ones, which are one action apart.
     """
 
     images: NDArray[np.uint8]
@@ -335,25 +341,27 @@ class History:
     """float64 [B, N, 3]: where each frame was taken, in the frame of frame 0 (x forward, y left, azimuth), so that
     `poses[:, -1]` is 0. In plans of gripper poses [B, N, 7], in the world's frame like `Control.ids`."""
     actions: NDArray[Any]
-    """int8 [B, N - 1, L]: the primitives carried out between neighbours, padded at the end with null tokens, L being
-    the most in the batch, at least 1. In plans of gripper poses float64 [B, N - 1, L, 7], padded with the last pose."""
+    """int8 [B, N - 1, L]: the primitives executed between neighbouring frames, padded at the end with null tokens; L is
+    the maximum over the batch, at least 1. In plans of gripper poses float64 [B, N - 1, L, 7], padded with the last
+    pose."""
     lengths: NDArray[np.int64]
-    """int64 [B, N - 1]: how many actions were carried out between neighbours; the rest of `actions` is padding."""
+    """int64 [B, N - 1]: how many actions were executed between neighbouring frames; the rest of `actions` is
+    padding."""
     count: NDArray[np.int64]
-    """int64 [B], from 1 to N: how many of the frames are not padding. Where an episode has fewer, its first one is
-    repeated in front, with no action between the copies."""
+    """int64 [B], from 1 to N: how many of the frames are not padding. If an episode has fewer than N, its first frame
+    is repeated in front, with no actions in between."""
 
     def __len__(self) -> int:
         return len(self.images)
 
     @property
     def valid(self) -> NDArray[np.bool_]:
-        """Whether each frame is none of the padding, bool [B, N]."""
+        """Whether each frame is not padding, bool [B, N]."""
         most = self.images.shape[1]
         return np.arange(most) >= most - self.count[:, None]
 
     def rows(self, rows: Sequence[int]) -> History:
-        """Return some rows, with no more padding of actions than they need."""
+        """Return some rows, with only as much action padding as they need."""
         index = np.asarray(rows, np.int64)
         lengths = self.lengths[index]
         longest = max(1, int(lengths.max(initial=0)))
@@ -382,7 +390,9 @@ def _pad_actions(actions: NDArray[Any], longest: int) -> NDArray[Any]:
 
 @dataclass(frozen=True)
 class Conditioning:
-    """What a world model sees, batched over candidates and episodes. Only what `accepts.needs` names is set."""
+    """What a world model sees, batched over candidates and episodes. Besides `image`, only what `accepts.needs` lists
+    is set.
+    """
 
     image: NDArray[np.uint8]
     """uint8 [B, H, W, 3] in the model's view and size."""
@@ -393,13 +403,13 @@ class Conditioning:
     history: History | None = None
     """The latest observations up to this one, with poses and actions between them."""
     simulators: Sequence[Any] | None = None
-    """Forks of the environment, one a row; given to `oracle` alone."""
+    """Forks of the environment, one per row; only for `oracle`."""
 
     def __len__(self) -> int:
         return len(self.image)
 
     def rows(self, rows: Sequence[int]) -> Conditioning:
-        """Return some rows; the batch itself where it is all of them."""
+        """Return some rows, or the batch itself if these are all of them."""
         if list(rows) == list(range(len(self))):
             return self
         index = list(rows)
@@ -414,35 +424,35 @@ class Conditioning:
 
 @dataclass(frozen=True)
 class Rollout:
-    """Imagined future of one candidate, in the views that the revising policy asked for."""
+    """The imagined future of one candidate, in the views that the reviser requested."""
 
     frames: NDArray[np.uint8]
     """uint8 [K, H, W, 3] (or [K, V, H, W, 3] for several views): frame k - 1 is what follows action k."""
     real: NDArray[np.bool_]
-    """bool [K]: True where the frame is the real panorama turned, not imagination."""
+    """bool [K]: True if the frame is the real panorama, rotated, rather than imagined."""
     view: str = "front"
-    """"front", "surround" or "panorama"; a perspective model gives "front" whatever was asked."""
+    """"front", "surround" or "panorama"; a perspective model always gives "front"."""
 
 
 @dataclass(frozen=True)
 class Fidelity:
-    """What would really have been seen along each plan of a decision. Privileged, as `Truth` is."""
+    """What would really have been seen along each plan of a decision. Privileged, like `Truth`."""
 
     rollouts: tuple[Rollout, ...]
     scores: NDArray[np.float64]
-    """float64 [M]: what the reviser gives the true futures."""
+    """float64 [M]: the reviser's scores of the true futures."""
     rank: float
-    """Kendall's tau between scores of imagined and of true futures, NaN where either tells no plans apart."""
+    """Kendall's tau between the scores of imagined and true futures; NaN if either does not distinguish the plans."""
     psnr: NDArray[np.float64]
     """float64 [M] dB: mean over a plan's imagined frames, latitude-weighted for panoramas; NaN without any."""
     ssim: NDArray[np.float64]
     lpips: NDArray[np.float64] | None = None
-    """float64 [M]: the same of perspective views, lower is truer; None where it is not measured."""
+    """float64 [M]: the same for perspective views, lower is better; None if not measured."""
     pose_errors: NDArray[np.float64] | None = None
-    """float64 [M, 2], metres and degrees: how far from their places the frames were taken; None where nobody knows."""
+    """float64 [M, 2], metres and degrees: distance of the frames' viewpoints from the right ones; None if unknown."""
 
     def regret(self, chosen: int | None) -> float:
-        """Return how much less than the best the chosen plan scores in truth; NaN for a plan made anew."""
+        """Return the best true score minus that of the chosen plan; NaN if the reviser wrote a new plan."""
         return float("nan") if chosen is None else float(self.scores.max() - self.scores[chosen])
 
 
@@ -451,27 +461,27 @@ class Exchange:
     """A question to a language model during a decision, and its outcome."""
 
     purpose: str
-    """What the policy wanted, such as "propose/0" or "answer"."""
+    """The purpose of the call, such as "propose/0" or "answer"."""
     model: str
     said: tuple[Mapping[str, Any], ...]
-    """Every completion: `call` (its question's name), `text`, `finish`, `logprobs`, `prompt_tokens`,
-    `completion_tokens`. With these a run can be replayed without the model."""
+    """Every completion: `call` (the digest of its question), `text`, `finish`, `logprobs`, `prompt_tokens`,
+    `completion_tokens`. They suffice to replay a run without the model."""
     result: Mapping[str, Any] = field(default_factory=dict)
     """How it was read: `by` ("logprobs" or "votes"), `mass` of the choices, whether it was `repaired`."""
     problem: str = ""
-    """Why the answer could not be used, "<kind>: <detail>"; empty where it could."""
+    """Why the answer could not be used, "<kind>: <detail>"; empty if it could."""
     instead: str = ""
-    """What the policy did instead."""
+    """The policy's fallback."""
 
 
 @dataclass(frozen=True)
 class Decision:
-    """The outcome of one pass through propose, imagine, revise, with all evidence kept."""
+    """The outcome of one pass of propose, imagine, revise, with all evidence."""
 
     actions: NDArray[Any]
-    """The plan that was chosen or written anew: int8 [K], or float64 [K, 7] gripper poses."""
+    """The chosen or newly written plan: int8 [K], or float64 [K, 7] gripper poses."""
     execute: int
-    """How many of `actions` are carried out before the next decision."""
+    """How many of `actions` are executed before the next decision."""
     proposals: tuple[Proposal, ...]
     rollouts: tuple[Rollout, ...] | None = None
     scores: NDArray[np.float64] | None = None
@@ -481,30 +491,30 @@ class Decision:
     goal: Goal | None = None
     key: Key | None = None
     seconds: Mapping[str, float] = field(default_factory=dict)
-    """Wall time by stage: propose, platform, world_model, cache, revise, environment (carrying it out). Episodes that
-    were decided for at once share the time equally."""
+    """Wall time by stage: propose, platform, world_model, cache, revise, environment (execution). Episodes decided in
+    one batch share the time equally."""
     calls: Mapping[str, int] = field(default_factory=dict)
-    """What this decision asked for, a function of the decision alone: consultations of the world model (0 or 1, one a
-    level of the beam search), and the rows and frames of its rollouts."""
+    """What this decision requested, independent of batching: calls of the world model (at most one per level of the
+    beam search), and the rows and frames of its rollouts."""
     note: str = ""
     answer: Answer | TextAnswer | None = None
-    """What the agent believes now, where the goal has choices or is a question."""
+    """What the agent believes now, if the goal has choices or is a question."""
     fidelity: Fidelity | None = None
-    """How true imagination was, where the run measures it."""
+    """How faithful imagination was, if the run measures it."""
     spent: Mapping[str, float] = field(default_factory=dict)
-    """What answering took, an equal share of the batch's: calls of the world model with their rows and frames, retries
-    among the calls, cached_rows that needed none, vlm_tokens; credits where a paid service imagines. A language model
-    adds vlm_calls, vlm_cached, vlm_retries, vlm_input_tokens, vlm_output_tokens, and vlm_usd where its price is known.
+    """Resources used, an equal share of the batch's: calls of the world model with their rows and frames, retries among
+    the calls, cached_rows that needed no call, vlm_tokens; credits of a paid service. A language model adds vlm_calls,
+    vlm_cached, vlm_retries, vlm_input_tokens, vlm_output_tokens, and vlm_usd if its price is known.
     """
     exchanges: tuple[Exchange, ...] = ()
-    """What a language model was asked, and what it said."""
+    """What a language model was asked, and what it answered."""
     pictures: Mapping[str, NDArray[np.uint8]] = field(default_factory=dict)
-    """What the policies believe, uint8 [H, W, 3] by name (`Policy.draw`); empty where the record keeps no pictures."""
+    """What the policies believe, uint8 [H, W, 3] by name (`Policy.draw`); empty if the record keeps no images."""
 
 
 @dataclass(frozen=True)
 class Truth:
-    """Privileged state of an episode. It reaches metrics, records and reports, never a policy or a world model."""
+    """Privileged state of an episode. It reaches metrics, records and reports, but never a policy or a world model."""
 
     position: NDArray[np.float64]
     """float64 [3] world metres, on the floor."""
@@ -527,32 +537,32 @@ class Episode:
     goal_position: tuple[float, float, float]
     goal_yaw: float
     geodesic: float
-    """Shortest path from start to goal in metres; NaN where an episode file does not give it."""
+    """Length of the shortest path from start to goal in metres; NaN if an episode file does not give it."""
     info: Mapping[str, Any] = field(default_factory=dict)
-    """ImageNav reads "ideal_primitives", the least number of primitives, "radius", the goal's own in metres, and
-    "goal_image", the file of a panorama at the goal; "tier" is the tier that it was generated for.
-    AR reads "target", an instance's id, and "category", what it is. Manipulation reads "task", "seed" and
-    "variation", and tells reports the "instruction"."""
+    """ImageNav reads "ideal_primitives" (the smallest number of primitives), "radius" (the goal's own, in metres) and
+    "goal_image" (the file of a panorama at the goal); "tier" is the tier it was generated for. AR reads "target", an
+    instance's id, and "category", what it is. Manipulation reads "task", "seed" and "variation", and gives reports the
+    "instruction"."""
 
     @property
     def kind(self) -> str:
-        """Which of several tasks in one it is of; empty where there is one."""
+        """The subtask it belongs to, if the task has several; otherwise empty."""
         return str(self.info.get("task", ""))
 
     @property
     def tier(self) -> str:
-        """The tier that it was generated for; empty for none."""
+        """The tier it was generated for; empty if none."""
         return str(self.info.get("tier", ""))
 
     @property
     def group(self) -> str:
-        """Its kind or tier, which reports show apart; empty for neither."""
+        """Its kind or tier, which reports show separately; empty if it has neither."""
         return self.kind or self.tier
 
 
 @dataclass(frozen=True)
 class DecisionRecord:
-    """One row of the run store: what was decided, and what truly happened."""
+    """One row of the run store: what was decided, and what really happened."""
 
     episode: int
     """Index in the run's episode list."""
@@ -560,34 +570,34 @@ class DecisionRecord:
     """0 for the first decision of the episode."""
     decision: Decision
     executed: NDArray[Any]
-    """What was carried out of the plan (less than planned when the episode ended on the way)."""
+    """The executed part of the plan (less than planned if the episode ended on the way)."""
     before: Truth
     after: Truth
     path: NDArray[np.float64]
     """float64 [len(executed) + 1, 3]: world positions from before the first to after the last primitive."""
     refused: tuple[str, ...] = ()
-    """Why ways of a gripper were not gone to their ends, one for each that was not."""
+    """Why gripper motions ended early, one reason for each that did."""
     end: Observation | ArmObservation | None = None
-    """What is seen when the episode has ended with this decision."""
+    """The final observation, if the episode ended with this decision."""
 
 
 @dataclass(frozen=True)
 class EpisodeResult:
-    """The end of one episode. `status` is "error" where something broke; it then counts in no score."""
+    """The end of one episode. `status` is "error" if something broke; such an episode is not scored."""
 
     episode: int
     episode_id: str
     scene: str
     status: Literal["done", "error"]
     metrics: Mapping[str, float] = field(default_factory=dict)
-    """ImageNav: success (0 or 1), actions, decisions, travelled, shortest, spl (0..1), distance_to_goal.
-    AR: success, actions, decisions, confidence, visible_start, visible_end (0..1), category, predicted (numbers of
-    choices). A-EQA: see `wiw.tasks.aeqa.AEQA.measure`."""
+    """ImageNav: success (0 or 1), actions, decisions, travelled, shortest, spl (0..1), distance_to_goal. AR: success,
+    actions, decisions, confidence, visible_start, visible_end (0..1), category, predicted (indices of choices). A-EQA:
+    see `wiw.tasks.aeqa.AEQA.measure`."""
     seconds: float = 0.0
     error: str = ""
     """Traceback."""
     kind: str = ""
-    """What failed: "environment", "agent", "worker" (its process died), "world_model/" and a `RolloutError.kind`,
-    "vlm/" and a `VlmError.kind`, or "judge/" and a `JudgeError.kind`."""
+    """The part that failed: "environment", "agent", "worker" (its process died), "world_model/" and a
+    `RolloutError.kind`, "vlm/" and a `VlmError.kind`, or "judge/" and a `JudgeError.kind`."""
     details: Mapping[str, Any] = field(default_factory=dict)
-    """Facts about the episode besides numbers, JSON-able. A-EQA: "answer" and its "judgement"."""
+    """Facts about the episode other than numbers, as JSON. A-EQA: "answer" and its "judgement"."""

@@ -39,13 +39,13 @@ class WeightFile(Generic[N]):
     @property
     def cure(self) -> str:
         """Return advice for a missing file."""
-        return f"`wiw train {self.name}` makes some"
+        return f"`wiw train {self.name}` creates one"
 
     def load(self, path: str | Path) -> tuple[N, dict[str, Any]]:
         """Load the network and its card.
 
         Raises:
-            WeightsError: there is no such file, or it is damaged, of another version or of something else.
+            WeightsError: it does not exist, is damaged, has another version, or holds something else.
         """
         path = Path(path).expanduser()
         if not path.is_file():
@@ -60,7 +60,7 @@ class WeightFile(Generic[N]):
             return network.eval(), dict(header["card"])
         except (OSError, SafetensorError, ArgumentError, KeyError, TypeError, ValueError, RuntimeError) as error:
             raise WeightsError(
-                f"{path}: expected weights of {self.name}, whole: {error}; {self.cure}", "unfit"
+                f"{path}: expected complete weights of {self.name}: {error}; {self.cure}", "unfit"
             ) from error
 
     def save(self, path: Path, network: N, card: Mapping[str, Any]) -> None:
@@ -78,19 +78,19 @@ class WeightFile(Generic[N]):
     def _check(self, values: Mapping[str, Tensor], expected: str | None, path: Path) -> None:
         """Check that the values are finite and match the digest in the file, if it has one."""
         if expected is not None and expected != digest(values):
-            wrong = "its values are not those that were written: it is damaged"
+            wrong = "its values differ from what was written: it is damaged"
         elif not all(value.isfinite().all() for value in values.values()):
-            wrong = "some of its values are no finite numbers: it is damaged, or its training failed"
+            wrong = "some of its values are not finite: it is damaged, or its training diverged"
         else:
             return
-        raise WeightsError(f"{path}: expected weights of {self.name}, whole; {wrong}; {self.cure}", "unfit")
+        raise WeightsError(f"{path}: expected complete weights of {self.name}; {wrong}; {self.cure}", "unfit")
 
     def _header(self, metadata: Mapping[str, str] | None, path: Path) -> dict[str, Any]:
         found = (metadata or {}).get("format")
         if not metadata or found != self.format:
             raise WeightsError(
-                f"{path}: expected the format '{self.format}' in its header, got {found!r}: weights of something else, "
-                f"or of another version; {self.cure}",
+                f"{path}: expected the format '{self.format}' in its header, got {found!r}: these are weights of "
+                f"something else, or of another version; {self.cure}",
                 "revision" if str(found).startswith(f"wiw-{self.name}") else "unfit",
             )
         return dict(json.loads(metadata["header"]))

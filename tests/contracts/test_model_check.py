@@ -195,31 +195,31 @@ BROKEN = {
     "nan": (lambda frames, *_: frames * np.float32("nan"), {}, "with NaN"),
     "type": (lambda frames, *_: frames.tolist(), {}, "got list"),
     "frames": (lambda frames, *_: frames[:, 1:], {}, r"actions \+ 1.*got uint8 \(1, 4"),
-    "frame 0": (dark, {}, "frame 0 is not the observation: it is another picture"),
+    "frame 0": (dark, {}, "frame 0 is not the observation: it is a different image"),
     "frame 0, mirrored": (mirrored, {}, "frame 0 is not the observation: it is mirrored"),
     "frame 0, inverted": (inverted, {}, "frame 0 is not the observation: it is inverted"),
-    "frame 0, noise": (noise, {}, "frame 0 is not the observation: it is another picture"),
-    "channels": (bgr, {}, r"frame 0 is not the observation: red and blue are exchanged \(BGR\)"),
-    "channels, after frame 0": (bgr_after_frame_0, {}, r"after frame 0, red and blue are exchanged \(BGR\)"),
-    "scale": (cast_without_scale, {}, r"floats from 0 to 1 were cast to uint8 as they are; give np\.rint"),
+    "frame 0, noise": (noise, {}, "frame 0 is not the observation: it is a different image"),
+    "channels": (bgr, {}, r"frame 0 is not the observation: red and blue are swapped \(BGR\)"),
+    "channels, after frame 0": (bgr_after_frame_0, {}, r"after frame 0, red and blue are swapped \(BGR\)"),
+    "scale": (cast_without_scale, {}, r"floats from 0 to 1 were cast to uint8 without scaling; give np\.rint"),
     "scale, after frame 0": (cast_after_frame_0, {}, "after frame 0, no value is above 1"),
-    "pictures, wrapped": (wrapped, {}, r"Values wrap around: in .*% of places .*np\.clip"),
+    "pictures, wrapped": (wrapped, {}, r"Values wrap around: at .*% of positions .*np\.clip"),
     "pictures, mirrored": (mirrored_after_frame_0, {}, "After frame 0, frames are mirrored"),
     "pictures, upside down": (upside_down_after_frame_0, {}, "After frame 0, frames are upside down"),
     "frame 0, shifted": (shift, {}, "Frame k is what follows action k"),
     "random": (by_chance, {}, "In two calls with the same seeds, 6 of 6 rows differ"),
-    "batch": (by_the_batch, {}, "alone, 2 of 2 rows differ from the same in a batch of 4"),
-    "batch, seeds": (from_the_first_seed, {}, "its own seed, not the batch's from the first one"),
+    "batch": (by_the_batch, {}, "alone, 2 of 2 rows differ from the same rows in a batch of 4"),
+    "batch, seeds": (from_the_first_seed, {}, "its own seed, not the whole batch's from the first one"),
     "causal": (looking_ahead, {"causal": True}, "It declares causal=True, but frames before"),
-    "inputs": (overwriting, {}, "It changes what it is given: observations.image"),
-    "inputs, plan": (moving_the_plan, {}, r"It changes what it is given: control\.viewpoints"),
-    "inputs, history": (forgetting, PAST, r"It changes what it is given: observations\.history\.images"),
+    "inputs": (overwriting, {}, "It modifies its inputs: observations.image"),
+    "inputs, plan": (moving_the_plan, {}, r"It modifies its inputs: control\.viewpoints"),
+    "inputs, history": (forgetting, PAST, r"It modifies its inputs: observations\.history\.images"),
     "batch, history": (counting_padding, PAST, "alone, 1 of 2 rows differ"),
     "raised, young": (needing_a_past, PAST, "IndexError"),
-    "memory": (reusing(), {}, "An answer lies in the memory of an earlier one"),
+    "memory": (reusing(), {}, "An answer uses the memory of an earlier one"),
     "memory, written to": (rewriting(), {}, "An answer was written to after it was returned"),
-    "needs": (dark, {"needs": ("simulator",)}, "needs the simulator, which is handed to the oracle alone"),
-    "needs, poses": (dark, {"space": "pose7"}, "poses of a gripper move none"),
+    "needs": (dark, {"needs": ("simulator",)}, "needs the simulator, which only the oracle is given"),
+    "needs, poses": (dark, {"space": "pose7"}, "gripper poses do not move the camera"),
 }
 
 
@@ -262,7 +262,7 @@ def test_an_honest_model_with_a_memory_is_left_in_peace(declared, two_rooms):
 def test_a_past_that_is_not_looked_at_is_noted(two_rooms):
     findings = found(spoilt(lambda *_: None, **PAST), two_rooms)
     assert set(findings) == {"history"} and not findings["history"].serious
-    assert "What was observed before makes no difference" in str(findings["history"])
+    assert "Past observations make no difference" in str(findings["history"])
 
 
 GRIPPER = {"control": "action", "space": "pose7", "view": "perspective", "size": (48, 48), "best_batch": 4}
@@ -303,7 +303,7 @@ def test_models_of_grippers_are_asked_about_poses(declared):
     assert found(Asked, "nowhere") == {}
     if declared in ({}, PAST):
         findings = found(type("Ahead", (Foreseeing,), {"accepts": Asked.accepts}), "nowhere")
-        assert set(findings) == {"causal"} and "a changed action change with it" in str(findings["causal"])
+        assert set(findings) == {"causal"} and "frames before a changed action change too" in str(findings["causal"])
 
 
 def test_a_gripper_that_is_not_looked_at_is_noted(monkeypatch):
@@ -316,14 +316,14 @@ def test_a_gripper_that_is_not_looked_at_is_noted(monkeypatch):
     monkeypatch.setattr(model_check, "LONG_RUN", 0.0)
     findings = found(Blind, "nowhere")
     assert set(findings) == {"plan", "slow"} and not any(finding.serious for finding in findings.values())
-    assert "200 episodes of manipulation asks for about 3000 of them" in str(findings["slow"])
+    assert "200 episodes of manipulation requests about 3000 of them" in str(findings["slow"])
 
 
 def test_what_is_good_to_know_breaks_nothing(two_rooms, monkeypatch):
     from wiw.studies import model_check
 
     findings = found(spoilt(nearly), two_rooms)
-    assert not findings["batch"].serious and "a CPU adds up in another order" in str(findings["batch"])
+    assert not findings["batch"].serious and "a CPU adds in a different order" in str(findings["batch"])
     assert "GPU" not in str(findings["batch"])
     still = found(
         spoilt(lambda frames, observations, *_: np.repeat(observations.image[:, None], frames.shape[1], 1)), two_rooms
@@ -342,7 +342,7 @@ def test_identity_is_looked_at_too(two_rooms):
             return {"weights": object()}
 
     findings = found(Odd, two_rooms)
-    assert "no JSON" in str(findings["describe"]) and "declares cacheable=True, but no version" in str(
+    assert "does not return JSON" in str(findings["describe"]) and "declares cacheable=True but no version" in str(
         findings["version"]
     )
 

@@ -254,10 +254,10 @@ def test_checkpoints_that_do_not_fit_are_named(made, world_model_options, tmp_pa
     refused(r"no .*config\.json.*those that you train", kind="missing")
     folder = given
     refused(
-        "trained for svd with 1 frames a latent, but this is ltx with 8; use the world model svd-action", "ltx-action"
+        "trained for svd with 1 frames per latent, but this is ltx with 8; use the world model svd-action", "ltx-action"
     )
     folder = copied("stride", stride=4)
-    refused("with 4 frames a latent")
+    refused("with 4 frames per latent")
     folder = copied("width", width=64)
     refused("does not fit its config.json: unet.mlp")
     folder = copied("format", colour="red")
@@ -277,13 +277,13 @@ def test_checkpoints_that_do_not_fit_are_named(made, world_model_options, tmp_pa
 @pytest.mark.parametrize("name", ["svd-action", "cosmos-predict2-action"])
 def test_a_lora_of_a_pipeline_that_takes_none_is_refused(name: str, made, tmp_path: Path) -> None:
     model = made(name)
-    with pytest.raises(ArgumentError, match="takes no LoRA: write its denoiser whole"):
+    with pytest.raises(ArgumentError, match="does not support LoRA: save its whole denoiser"):
         checkpoint.save(tmp_path / "lora", model.conditioning.encoders, model.generator.pipeline, lora=True)
     folder = shutil.copytree(model.checkpoint, tmp_path / "checkpoint")
     (folder / "pytorch_lora_weights.safetensors").write_bytes(b"of another trainer")
     rollout(made(name, checkpoint=str(folder)), [FORWARD])  # its whole denoiser counts
     shutil.rmtree(folder / model.denoisers[0])
-    with pytest.raises(WeightsError, match=r"as save_pretrained writes, since \w+ takes no LoRA"):
+    with pytest.raises(WeightsError, match=r"as written by save_pretrained, since \w+ takes no LoRA"):
         made(name, checkpoint=str(folder))
 
 

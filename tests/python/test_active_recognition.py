@@ -247,7 +247,7 @@ def test_confidence_is_a_probability(two_rooms: str) -> None:
 
 
 def test_a_scene_without_any_of_the_categories_says_what_it_has(two_rooms: str) -> None:
-    with pytest.raises(ArgumentError, match=r"holds nothing of the categories bathtub.*categories=\["):
+    with pytest.raises(ArgumentError, match=r"has no object of the categories bathtub.*categories=\["):
         AR(two_rooms).episodes(1)
     assert tuple(sorted(ar.CATEGORIES)) == ar.CATEGORIES
 

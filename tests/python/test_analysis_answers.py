@@ -179,12 +179,12 @@ def test_the_judge_is_named_and_approximate_marks_are_marked(run: Path) -> None:
 def test_unlike_judges_are_not_compared(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     episodes = make_episodes(QUESTIONS, SCENES)
     ours, theirs = write_run(tmp_path / "a", episodes, ARMS), write_run(tmp_path / "b", episodes, ARMS, Fixed(4))
-    with pytest.raises(StoreError, match=r"judge is .rules\+approximate.*fixed4.*unlike judges.*wiw judge"):
+    with pytest.raises(StoreError, match=r"judge is .rules\+approximate.*fixed4.*different judges.*wiw judge"):
         wiw.compare(ours, theirs)
     wiw.judge(ours, Fixed(4), progress=False)
     with pytest.raises(StoreError, match="both have marks by fixed4"):
         wiw.compare(ours, theirs)
-    with pytest.raises(StoreError, match="unlike judges"):
+    with pytest.raises(StoreError, match="different judges"):
         wiw.compare(load_run(ours), load_run(ours, judge="fixed4"), arm="none", other="warp")
     found = wiw.compare(ours, theirs, judge="fixed4")
     assert found.difference("warp · b", "warp · a", "answer_score").estimate.value == 0
@@ -192,7 +192,7 @@ def test_unlike_judges_are_not_compared(tmp_path: Path, capsys: pytest.CaptureFi
     assert [each.base for each in found.breakdowns if each.base] == ["none · a", "warp · a"]
     with pytest.raises(ArgumentError, match="no marks by it"):
         wiw.compare(ours, theirs, judge="rules")
-    assert main(["compare", str(ours), str(theirs)]) == 2 and "unlike judges" in capsys.readouterr().err
+    assert main(["compare", str(ours), str(theirs)]) == 2 and "different judges" in capsys.readouterr().err
     assert main(["compare", str(ours), str(theirs), "--judge", "fixed4"]) == 0
     assert "Marks by judge fixed4" in capsys.readouterr().out
 

@@ -100,15 +100,15 @@ def test_several_arms_are_reckoned_with_as_holm_does():
     ("numbers", "message"),
     [
         ({"difference": 0}, "a difference other than 0"),
-        ({"difference": 90}, "no more than the 80 % that the base fails in won, got 92 %"),
-        ({"difference": -30}, "no more than the base's 20 % of episodes lost, got 32 %"),
+        ({"difference": 90}, "at most the 80 % in which the base fails won, got 92 %"),
+        ({"difference": -30}, "at most the base's 20 % of episodes lost, got 32 %"),
         ({"difference": 10, "correlation": 1.0}, "correlation in [0, 1)"),
         ({"difference": 10, "chance": 1.0}, "chance between 0 and 1"),
         ({"difference": 0.01}, "more than 100000 scenes"),
         ({}, "either a difference"),
         ({"difference": 10, "scenes": 20}, "either a difference"),
         ({"scenes": 1}, "at least 2 scenes"),
-        ({"scenes": 2, "per_scene": 1}, "no difference up to 78 points"),
+        ({"scenes": 2, "per_scene": 1}, "cannot show a difference of up to 78 points"),
         ({"scenes": 20, "arms": 0}, "arms of at least 1"),
     ],
 )
@@ -150,7 +150,7 @@ def test_a_pilot_says_how_many_episodes_the_next_run_needs(tmp_path, capsys):
         (["--pilot", str(run)], "--pilot RUN with --pilot-arms ARM,BASE"),
         (["--pilot", str(run), "--pilot-arms", "mine"], "expected --pilot-arms ARM,BASE, got 'mine'"),
         (["--pilot", str(run), "--pilot-arms", "mine,oracle"], "no arm 'oracle'"),
-        (["--task", "chess"], "no pilot of task 'chess'; there are imagenav"),
+        (["--task", "chess"], "no pilot for task 'chess'; choose from imagenav"),
     ):
         assert main(["power", "15", *flags]) == 2 and message in " ".join(capsys.readouterr().err.split())
 

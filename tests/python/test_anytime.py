@@ -102,7 +102,7 @@ def test_rules_that_are_understood(text, targets, width):
     ("text", "message"),
     [
         ("oracle-warp excludes 0", "'oracle-warp' is neither an arm nor a difference of two"),
-        ("oracle excludes 0", "one arm, whose SR is no difference"),
+        ("oracle excludes 0", "a single arm, not a difference"),
         ("oracle-none excludes 5", "no such rule"),
         ("width<0", "no interval is narrower than 0 points"),
         ("width(warp)<8", "'warp' is neither an arm"),
@@ -156,7 +156,7 @@ def test_a_run_stops_as_soon_as_it_has_shown_enough(tmp_path, capsys):
     for page in (str(numbers), log.report().read_text()):
         text = " ".join(page.split())
         assert (
-            f"looked at every 16 episodes, to stop once oracle-none excludes 0. It stopped at {stopped['episodes']}"
+            f"checked every 16 episodes, to stop once oracle-none excludes 0. It stopped at {stopped['episodes']}"
             in text
         )
         assert "a betting test over scenes" in text
@@ -180,7 +180,7 @@ def test_the_interval_at_the_stop_is_that_of_scenes_in_order(tmp_path):
 def test_a_run_that_is_never_sure_ends_with_its_episodes(tmp_path):
     log = run_arms(LineTask(), AGENTS, 12, out=tmp_path, until="width<1", look_every=5, progress=False)
     assert "stopped" not in log.store.info and len(log.episodes) == 24
-    assert "It was not stopped so far" in " ".join(str(log.numbers()).split())
+    assert "It has not been stopped so far" in " ".join(str(log.numbers()).split())
 
 
 def test_an_interrupted_run_goes_on_to_the_same_stop(tmp_path, monkeypatch):
@@ -230,7 +230,7 @@ def test_command_line(tmp_path, capsys):
     assert main([*run, "--until", "twin-none excludes 1"]) == 2
     assert "expected 'A-B excludes 0'" in capsys.readouterr().err and not (tmp_path / "run").exists()
     assert main([*run, "--until", "twin-none excludes 0"]) == 0
-    assert "until   twin-none excludes 0; a look every 4 episodes per arm" in capsys.readouterr().err
+    assert "until   twin-none excludes 0; checked every 4 episodes per arm" in capsys.readouterr().err
     assert wiw.load_run(tmp_path / "run").store.info["until"] == {"rule": "twin-none excludes 0", "every": 4}
     with sqlite3.connect(tmp_path / "run" / "run.sqlite") as store:
         store.execute("DELETE FROM outcome WHERE arm = 'twin' AND episode > 5")

@@ -213,8 +213,8 @@ def a_file(path: Path, scene: str, **info: Any) -> Path:
     [
         ({"target": None}, r"episode 0: info\.target: expected the id of an instance .* got None"),
         ({"target": 0}, r"info\.target"),
-        ({"category": ""}, r"episode 0: info\.category: expected what the target is, got ''"),
-        ({"category": "sofa"}, r"episode 0: info\.category 'sofa' is none of the categories chest, .*categories=\["),
+        ({"category": ""}, r"episode 0: info\.category: expected the target's category, got ''"),
+        ({"category": "sofa"}, r"episode 0: info\.category 'sofa' is not among the categories chest, .*categories=\["),
     ],
 )
 def test_bad_fields_are_named(tmp_path: Path, two_rooms: str, info: dict[str, Any], message: str) -> None:
@@ -231,7 +231,7 @@ def test_a_scene_that_is_not_there_is_named(tmp_path: Path) -> None:
 
 def test_a_target_that_the_scene_has_not_is_named(tmp_path: Path, two_rooms: str) -> None:
     task = AR(episode_file=a_file(tmp_path / "ar.json", two_rooms, target=99))
-    with pytest.raises(ArgumentError, match=r"target 99 is no instance of .*which has 1 to 11"):
+    with pytest.raises(ArgumentError, match=r"target 99 is not an instance of .*which has 1 to 11"):
         task.environment().begin(task.episode(0))
 
 

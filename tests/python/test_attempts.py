@@ -207,14 +207,14 @@ class Wrong(Scripted):
 
 
 def test_a_constructor_is_held_to_the_deadline_and_its_errors_have_a_type(two_rooms) -> None:
-    with pytest.raises(ConstructionError, match=r"'Slow' cannot be made.*within 0\.1 s") as caught:
+    with pytest.raises(ConstructionError, match=r"'Slow' cannot be built.*within 0\.1 s") as caught:
         make_model(Slow, 0.1)
     assert caught.value.kind == "deadline"
     with pytest.raises(ConstructionError, match=r"within 0\.1 s"):
         AgentRecipe("matcher", Slow).build(RunContext(ImageNav(scenes=two_rooms)), Limits(deadline=0.1))
     assert isinstance(make_model(Fetching, 0.05), Fetching)
     for error in (OSError("no weights"), SystemExit(3)):
-        with pytest.raises(ConstructionError, match=r"cannot be made: (OSError: no weights|SystemExit: 3)") as caught:
+        with pytest.raises(ConstructionError, match=r"cannot be built: (OSError: no weights|SystemExit: 3)") as caught:
             make_model(Wrong, 5, error=error)
         assert caught.value.kind == "raised" and caught.value.__cause__ is error
     with pytest.raises(ArgumentError, match="mine"):

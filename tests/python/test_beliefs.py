@@ -213,7 +213,7 @@ def test_wrapped_policies_draw():
 @pytest.mark.parametrize(
     ("pictures", "wrong"),
     [
-        ([np.zeros((4, 4, 3), np.uint8)], "expected pictures by name, got list"),
+        ([np.zeros((4, 4, 3), np.uint8)], "expected a mapping from names to images, got list"),
         ({"../map": np.zeros((4, 4, 3), np.uint8)}, "expected names of letters, digits and underscores, got '../map'"),
         ({"map": np.zeros((4, 4, 3))}, r"expected 'map' as uint8 \[H, W, 3\], got float64 \[4, 4, 3\]"),
         ({"map": np.zeros((4, 4), np.uint8)}, r"got uint8 \[4, 4\]"),
@@ -268,7 +268,7 @@ def log(episode, tmp_path_factory):  # noqa: F811
     """A short episode of the explorer, with an answer that the page must not take for markup."""
     info = {**episode.info, "question": {**episode.info["question"], "extra_answers": ["<b>navy</b>"]}}
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr("wiw.policies.explorer.name_color", lambda pixels, category: ("blue", 0.8))
+        patch.setattr("wiw.policies.explorer.policy.name_color", lambda pixels, category: ("blue", 0.8))
         task = make_task(replace(episode, info=info), actions=45)
         agents = {"none": wiw.Agent(make_explorer(), **task.defaults)}
         out = tmp_path_factory.mktemp("beliefs") / "run"

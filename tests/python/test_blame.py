@@ -224,7 +224,7 @@ def test_what_cannot_be_attributed_says_why(run: Path, two_rooms: str, tmp_path:
     with pytest.raises(ArgumentError, match=r"noise in .* has no failure to explain"):
         wiw.blame(run, "noise")
     change(run, "UPDATE run SET wiw_version = '0.0.1'")
-    with pytest.raises(StoreError, match=r"was begun by wiw 0\.0\.1"):
+    with pytest.raises(StoreError, match=r"was started by wiw 0\.0\.1"):
         wiw.blame(run, "liar")
     assert not (run / "blame").exists()
 

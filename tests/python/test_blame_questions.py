@@ -145,7 +145,7 @@ def test_an_arm_of_another_policy_is_refused_before_anything_runs(run: Path, cap
         with pytest.raises(ArgumentError, match=r"'explorer-oracle'.*only policy 'explorer'.*imagination, "):
             wiw.blame(run, arms, progress=False)
     assert main(["blame", str(run)]) == 2
-    assert "choose from the arms that have it: --arm none" in capsys.readouterr().err
+    assert "choose from the arms with that policy: --arm none" in capsys.readouterr().err
     assert not (run / "blame").exists()
 
 
@@ -160,7 +160,7 @@ def test_only_explorers_that_answer_themselves_can_be_blamed(policy: str, revise
 def test_a_run_without_an_explorer_says_how_to_make_one(run: Path, tmp_path: Path) -> None:
     shutil.copytree(run, tmp_path / "run")
     change_info(tmp_path / "run", lambda info: [agent.update(policy="vlm") for agent in info["agents"].values()])
-    with pytest.raises(ArgumentError, match=r"policy 'vlm'.*`wiw run aeqa --policy explorer` makes a run"):
+    with pytest.raises(ArgumentError, match=r"policy 'vlm'.*`wiw run aeqa --policy explorer` starts a run"):
         wiw.blame(tmp_path / "run", progress=False)
     assert not (tmp_path / "run" / "blame").exists()
 

@@ -17,7 +17,7 @@ from wiw.cli.flag_help import read_flags
 from wiw.cli.options import parse_options
 from wiw.cli.parts import AgentFlags
 from wiw.errors import ArgumentError
-from wiw.scenes import scans
+from wiw.scenes.scans import formats
 from wiw.studies.run_log import load_run
 from wiw.tasks.imagenav import ImageNav
 
@@ -40,7 +40,7 @@ def test_help_teaches_by_examples(capsys):
         (["check-model"], "wiw check-model my_model.py:MyModel"),
         (["verify"], "--episodes 10"),
         (["export"], "--rerun first.rrd"),
-        ([], "75 stopped by SIGTERM"),
+        ([], "75 stopped within 6 seconds by SIGTERM"),
         (["scenes"], "apartments:val:4"),
         (["demo"], "oracle, a reference"),
         (["collect"], "--out demos --workers 4"),
@@ -59,7 +59,7 @@ def test_help_names_every_kind_of_scans(command, capsys):
     with pytest.raises(SystemExit):
         main([*command, "--help"])
     printed = capsys.readouterr().out
-    assert [kind for kind in scans.KINDS if f"{kind}:DIR" not in printed] == []
+    assert [kind for kind in formats.KINDS if f"{kind}:DIR" not in printed] == []
 
 
 def test_no_command_shows_help_and_a_wrong_one_is_refused(capsys):
@@ -93,7 +93,7 @@ def test_list_names_everything_with_a_line(capsys):
 def test_run_prints_a_table_and_writes_a_report(tmp_path, capsys):
     assert run("--episodes", 4, "--out", tmp_path / "run", "--seed", 3) == 0
     shown = capsys.readouterr().out
-    assert "SR %" in shown and "none" in shown and " s for scenes and episodes" in shown
+    assert "SR %" in shown and "none" in shown and " s to prepare scenes and episodes" in shown
     assert str(tmp_path / "run" / "report.html") in shown
     log = load_run(tmp_path / "run")
     assert log.complete and log.store.config["seed"] == 3
@@ -190,7 +190,7 @@ def test_a_world_model_takes_options(tmp_path, two_rooms, short, capsys):
     given = {"weights": "123", "strength": 0.25}
     assert taken == {"none": {}, "placebo-shuffled": given, "Tinted": given}
     assert main(["resume", str(tmp_path / "run"), "--no-report"]) == 0
-    for wrong, said in (("weights", "KEY=VALUE"), ("speed=3", "unexpected keyword"), ("strength=[", "no YAML")):
+    for wrong, said in (("weights", "KEY=VALUE"), ("speed=3", "unexpected keyword"), ("strength=[", "not valid YAML")):
         assert main([*task, *model, "--world-model-option", wrong, "--out", str(tmp_path / "again")]) == 2
         assert said in capsys.readouterr().err
         assert not (tmp_path / "again").exists()  # so that the same folder may be named once it is put right
@@ -265,7 +265,7 @@ def test_errors_are_one_clean_line(tmp_path, capsys):
 
 
 def test_a_run_that_could_not_begin_leaves_nothing_behind(tmp_path, capsys, monkeypatch):
-    """The server wants another token: once it has the right one, the same command begins the run."""
+    """The server expects a different token: once it has the right one, the same command begins the run."""
     from wiw.serving.background import serve_in_background
 
     monkeypatch.delenv("WIW_TOKEN", raising=False)
@@ -276,7 +276,7 @@ def test_a_run_that_could_not_begin_leaves_nothing_behind(tmp_path, capsys, monk
             if token is not None:
                 monkeypatch.setenv("WIW_TOKEN", token)
             assert run(*asked) == 2
-            assert "wants another token" in capsys.readouterr().err
+            assert "expects a different token" in capsys.readouterr().err
             assert not (tmp_path / "run").exists()
 
 
@@ -426,7 +426,7 @@ def test_each_task_names_the_policy_that_runs_it():
     assert {TaskRecipe(name).find_policy() for name in named} <= set(POLICIES.names())
     assert TaskRecipe("imagenav", {"preset": "foresight"}).find_policy() == "navigator"
     assert TaskRecipe("ar", {"preset": "foresight"}).find_policy() == "recogniser"
-    with pytest.raises(ArgumentError, match="names no default"):
+    with pytest.raises(ArgumentError, match="has no default policy"):
         TaskRecipe(f"{Path(__file__).parent / 'fakes.py'}:LineTask").find_policy()
 
 
@@ -434,8 +434,8 @@ def test_descriptions_of_flags_are_paragraphs(capsys):
     with suppress(SystemExit):
         main(["run", "--help"])
     words = " ".join(" ".join(line.strip("│ ") for line in capsys.readouterr().out.splitlines()).split())
-    assert "given again. isolate=false runs a model of your own in the process of the run. (repeatable)" in words
-    assert "the policy's own choice if not given. --revision-option" in words  # and no "(default: None)"
+    assert "repeated. isolate=false runs your own model in the run's process. (repeatable)" in words
+    assert "Default: the policy's own choice. --revision-option" in words  # and no "(default: None)"
     flags = StructTypeInfo.make(AgentFlags, AgentFlags(), False)
     texts = {field.name: field.helptext() for field in read_flags(flags).fields}
     assert all(texts.values()) and not any("\n" in text for text in texts.values())

@@ -83,7 +83,7 @@ def test_parameters_are_stored_and_checked(tmp_path: Path) -> None:
     values = json.loads(PARAMETERS.read_text())
     for wrong in ("{", json.dumps({**values, "shift": [0.0]}), json.dumps({**values, "colors": ["blue"]}), "[]", "{}"):
         (tmp_path / "wrong.json").write_text(wrong)
-        with pytest.raises(WeightsError, match="expected parameters of colour naming") as error:
+        with pytest.raises(WeightsError, match="expected parameters for colour naming") as error:
             ColorNamer.load(tmp_path / "wrong.json")
         assert error.value.kind == "unfit"
     with pytest.raises(WeightsError) as error:

@@ -57,11 +57,11 @@ def test_list_takes_a_kind(what: str, names: list[str], others: list[str], capsy
 @pytest.mark.parametrize(
     ("arguments", "message"),
     [
-        (["--policy-option", "a=b"], "policy matcher: unknown option 'a'; there are histogram,"),
+        (["--policy-option", "a=b"], "policy matcher: unknown option 'a'; expected one of histogram,"),
         (["--policy-option", "turn=left"], "policy matcher: turn: expected a number, got 'left'"),
         (["--width", "2"], "give --depth 2 or more"),
         (["--fidelity-share", "0.5"], "give --fidelity"),
-        (["--served", "warp"], "say how many by --servers"),
+        (["--served", "warp"], "give their number with --servers"),
         (["--cache", "off", "--cache-gb", "3"], "leave one of them out"),
         (["--look-every", "5"], "give --until"),
         (["--policy", "recogniser"], "use it with task ar"),

@@ -170,7 +170,7 @@ def test_arms_differ_in_what_they_are_named_after() -> None:
     [
         ({"models": ("svd",)}, "expected models among warpnet, pocket, got"),
         ({"seeds": (1, 1)}, "expected different seeds"),
-        ({"sizes": 2}, "3 sizes or more"),
+        ({"sizes": 2}, "at least 3 sizes"),
     ],
 )
 def test_settings_that_make_no_study_are_refused(changes: dict[str, Any], said: str) -> None:
@@ -304,7 +304,7 @@ def test_a_finished_study_is_not_trained_again(
     printed = capsys.readouterr().out
     assert "data-scaling.html" in printed and "The gain of one epoch, split" in printed
     assert main([*command, "--seeds", "0"]) == 2
-    assert "another study: seeds [0, 1] there and [0] asked" in " ".join(capsys.readouterr().err.split())
+    assert "different study: seeds was [0, 1], now [0]" in " ".join(capsys.readouterr().err.split())
 
 
 def test_a_training_that_was_stopped_ends_with_the_same_weights(
@@ -356,7 +356,7 @@ def test_pocket_is_trained_and_measured_by_the_same_job(study: DataScaling, data
 
 
 def test_a_dataset_that_is_too_small_says_so(dataset: Path) -> None:
-    with pytest.raises(ArgumentError, match=r"expected 12800 clips of 6 frames .* or ask for fewer \(--clips \d+\)"):
+    with pytest.raises(ArgumentError, match=r"expected 12800 clips of 6 frames .* or use fewer clips \(--clips \d+\)"):
         make_plan(dataset, replace(SETTINGS, clips=12_800))
     with pytest.raises(ArgumentError, match="0 held out; choose another share"):
         make_plan(dataset, replace(SETTINGS, held_out=0.0))

@@ -189,7 +189,7 @@ def test_the_picture_of_a_published_goal_is_its_front_view(tmp_path: Path, two_r
     assert told.episode(0).info["goal_image"] == str(tmp_path / "i.png")
     assert np.abs(env.goal.image.astype(float) - place.goal.image).mean() < 3  # but for sharpness
     (tmp_path / "i.png").write_bytes(b"no picture")
-    with pytest.raises(FileError, match="expected the picture of a goal"):
+    with pytest.raises(FileError, match="expected a goal image"):
         told.environment().begin(told.episode(0))
     cv2.imwrite(str(tmp_path / "i.png"), image[:, :100])
     with pytest.raises(FileError, match="about twice as wide as high, got 576x100"):
@@ -283,11 +283,11 @@ def test_damaged_files_are_named(tmp_path: Path, content: bytes) -> None:
 
 @pytest.mark.parametrize("option", [{"scenes": "apartments:val"}, {"per_scene": 3}, {"tier": "far"}])
 def test_a_file_of_episodes_leaves_no_option_unused(option) -> None:
-    with pytest.raises(ArgumentError, match=f"{next(iter(option))}: this is for generated episodes"):
+    with pytest.raises(ArgumentError, match=f"{next(iter(option))}: only for generated episodes"):
         ImageNav(episode_file="episodes.json", **option)
     assert ImageNav(**option).episode_file is None
 
 
 def test_a_folder_of_scenes_without_a_file_of_episodes_is_refused() -> None:
-    with pytest.raises(ArgumentError, match="scene_folder says where the scenes of an episode file are"):
+    with pytest.raises(ArgumentError, match="scene_folder is where the scenes of an episode file are"):
         ImageNav(scene_folder="scans")

@@ -314,7 +314,7 @@ def test_the_command_line(tmp_path: Path, capsys: pytest.CaptureFixture[str]) ->
     assert "1 demonstrations of 16 frames" in printed.out and "failed at 0 tables" in printed.out
     assert "slide_block: 1/1 demonstrations" in printed.err
     assert main([*arguments, "--size", "96", "--out", str(out)]) == 2
-    assert "size 64 there and 96 asked" in capsys.readouterr().err
+    assert "size was 64, now 96" in capsys.readouterr().err
 
 
 # -- what cannot be ----------------------------------------------------------------------------------------------------
@@ -343,7 +343,7 @@ def test_what_cannot_be_collected_is_refused(tmp_path: Path, asked: dict[str, An
 
 def test_a_folder_of_something_else_is_left_alone(tmp_path: Path) -> None:
     (tmp_path / "thesis.tex").write_text("%")
-    with pytest.raises(FileError, match="is missing; expected a manifest of `wiw collect`"):
+    with pytest.raises(FileError, match="does not exist; expected a manifest of `wiw collect`"):
         wiw.collect(tmp_path, **SMALL)
     assert [path.name for path in tmp_path.iterdir()] == ["thesis.tex"]
     (tmp_path / "thesis.tex").rename(tmp_path / "manifest.json")
@@ -391,7 +391,7 @@ def test_files_that_are_missing_or_damaged_are_named(collected: Path, tmp_path: 
         Demonstrations(tmp_path)
     assert [each.task for each in Demonstrations(tmp_path, partial=True)] == ["slide_block", "insert_peg"]
     (tmp_path / "manifest.json").unlink()
-    with pytest.raises(FileError, match="is missing; expected a manifest of `wiw collect`"):
+    with pytest.raises(FileError, match="does not exist; expected a manifest of `wiw collect`"):
         Demonstrations(tmp_path)
 
 

@@ -18,8 +18,8 @@ from recognition_file import a_file
 from wiw.cli import main
 from wiw.errors import ArgumentError, PromptError
 from wiw.policies.vlm.prompt_images import resize_view
-from wiw.policies.vlm.prompt_import import CARD, write_templates
-from wiw.policies.vlm.prompts import Prompts
+from wiw.policies.vlm.prompt_import.importer import CARD, write_templates
+from wiw.policies.vlm.prompts.templates import Prompts
 from wiw.registry import POLICIES, WORLD_MODELS, task_class
 from wiw.runs.compose import RunContext
 from wiw.runs.departures import EPISODES, find_departures
@@ -312,7 +312,7 @@ def test_reasons_of_a_file_of_ones_own_are_checked(tmp_path: Path) -> None:
     found = find_departures(ImageNav("apartments:val", preset=own), {"arm": AgentRecipe("vlm")})
     assert "radius 1.0 (paper: 0.5): our floor is large" in [str(each) for each in found]
     own.write_text("departures:\n  everyone: {radius: why}\n")
-    with pytest.raises(ArgumentError, match=r"own\.yaml: departures: expected reasons by whom they concern"):
+    with pytest.raises(ArgumentError, match=r"own\.yaml: departures: expected reasons, grouped by whom they concern"):
         ImageNav("apartments:val", preset=own)
     own.write_text("models: [ltx]\n")
     with pytest.raises(ArgumentError, match="models: expected options by name"):

@@ -70,8 +70,8 @@ def test_answers_that_break_the_contract_are_named(answer: Any, reason: str) -> 
     [
         (IMAGES[0], ["a"], "uint8 \\[H, W, 3\\]"),
         (IMAGES.astype(float), ["a"], "float64"),
-        (IMAGES, ["a", "a"], "names that differ"),
-        (IMAGES, [" "], "not empty"),
+        (IMAGES, ["a", "a"], "distinct, non-empty names"),
+        (IMAGES, [" "], "non-empty"),
     ],
 )
 def test_questions_are_checked(images: Any, names: Any, message: str) -> None:
@@ -112,7 +112,7 @@ def test_the_simulator_fills_boxes() -> None:
     assert second.shape == (0, 20, 30)
     with pytest.raises(ArgumentError, match="left < right"):
         segmenter.segment(IMAGES[:1], [[[20, 0, 5, 9]]], ids=IDS[:1])
-    with pytest.raises(ArgumentError, match="one array of boxes an image"):
+    with pytest.raises(ArgumentError, match="one array of boxes per image"):
         segmenter.segment(IMAGES, boxes[:1], ids=IDS)
 
 

@@ -479,7 +479,7 @@ def test_training_that_was_stopped_goes_on_to_the_same_end(seen: Samples, tmp_pa
     assert steps == [4, 5, 6]
     for name, value in whole.state_dict().items():
         assert torch.equal(value, on.state_dict()[name])
-    with pytest.raises(ArgumentError, match="other data or options"):
+    with pytest.raises(ArgumentError, match="different data or options"):
         Checkpoint(file, {"a": 2}).load()
     file.write_bytes(file.read_bytes()[:50])
     with pytest.raises(FileError, match="delete it"):
@@ -531,7 +531,7 @@ def test_a_checkpoint_that_finds_no_room_says_so(tmp_path: Path) -> None:
 
 def test_the_command_says_what_it_needs(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     assert main(["train", "diffuser", "--out", str(tmp_path / "x")]) == 2
-    assert "a folder of `wiw collect manipulation --depth` by --demonstrations" in capsys.readouterr().err
+    assert "a folder of `wiw collect manipulation --depth` with --demonstrations" in capsys.readouterr().err
 
 
 def test_the_command_wants_views_as_it_will_see_them(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:

@@ -92,7 +92,7 @@ def contents_of(file):
 def test_what_is_there_already_is_kept(log, tmp_path):
     (tmp_path / "mine").mkdir()
     (tmp_path / "mine" / "thesis.tex").write_text("mine")
-    with pytest.raises(FileError, match="mine holds something already"):
+    with pytest.raises(FileError, match="mine is not empty"):
         log.export(csv=tmp_path / "mine")
     assert [path.name for path in (tmp_path / "mine").iterdir()] == ["thesis.tex"]
 

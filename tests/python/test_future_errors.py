@@ -15,12 +15,12 @@ from wiw.action import FORWARD, TURN_LEFT
 from wiw.cli import main
 from wiw.datasets.questions.facts import STRUCTURE
 from wiw.errors import ArgumentError, RolloutError
-from wiw.experiments.errors import ERRORS, make_error
 from wiw.experiments.errors.content import list_barriers, list_things
 from wiw.experiments.errors.control import MotionDegradation, list_moves
 from wiw.experiments.errors.drawing import paste_copies
 from wiw.experiments.errors.erroneous import Erroneous
 from wiw.experiments.errors.forks import Walker, WorldFork
+from wiw.experiments.errors.kinds import ERRORS, make_error
 from wiw.experiments.errors.looks import FrameDegradation
 from wiw.experiments.fidelity import FidelityObserver
 from wiw.loop.attempts import Attempted
@@ -306,7 +306,7 @@ def test_an_error_must_make_sense_for_task_and_model(two_rooms: str) -> None:
     table, room = Manipulation(), ImageNav(scenes=two_rooms)
     for arm, task, text in (
         ("error-open@1", table, "not defined for plans of space 'pose7'"),
-        ("error-lag@1:warp", room, "only the oracle is handed"),
+        ("error-lag@1:warp", room, "only the oracle is given"),
     ):
         (recipe,) = arm_recipes(AgentRecipe(task.default_policy), [arm]).values()
         with pytest.raises(ArgumentError, match=text):
@@ -319,7 +319,7 @@ def test_a_scene_without_labels_has_no_things_to_change() -> None:
     scene = wiw.scenes.Scene.from_arrays(
         [{"positions": np.eye(3, dtype=np.float32), "triangles": np.array([[0, 1, 2]])}], name="plain"
     )
-    with pytest.raises(ArgumentError, match="plain has no things that could be drawn otherwise"):
+    with pytest.raises(ArgumentError, match="plain has no things that could be changed"):
         list_things(scene)
 
 

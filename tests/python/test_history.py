@@ -391,7 +391,7 @@ def test_who_declares_a_history_says_that_it_is_needed() -> None:
     assert wiw.accepts("image").history == 0 == wiw.accepts("image", history=0).history
     for wrong, said in (
         ({"history": 4}, r"without needs=\('history',\)"),
-        ({"history": 4, "needs": ("depth",)}, "declare both, or neither"),
+        ({"history": 4, "needs": ("depth",)}, "declare both or neither"),
         ({"history": 0, "needs": ("history",)}, "at least 1, got 0"),
         ({"history": 2.5, "needs": ("history",)}, "whole number"),
         ({"history": True, "needs": ("history",)}, "whole number"),

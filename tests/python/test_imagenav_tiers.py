@@ -225,7 +225,8 @@ def test_episodes_of_a_tier_keep_its_rules_and_spread_over_its_lengths(home: str
 def test_a_scene_from_which_a_tier_cannot_be_made_says_which_rule_is_not_met(two_rooms: str) -> None:
     rules = {"goal_depth": 0.3, "goal_instances": 1, "attempts": 20}
     with pytest.raises(
-        EpisodesError, match=r"tier 'beyond', no start and goal among 200.*What got furthest broke.*attempts=200\)"
+        EpisodesError,
+        match=r"tier 'beyond', no start and goal among 200.*rule that the best attempts broke.*attempts=200\)",
     ) as no:
         generate(world(two_rooms, "cpu"), 1, 0, EpisodeRules(tier="beyond", **rules))
     assert no.value.rule == NO_FORK in RULES  # two rooms and one door: nowhere does the way fork

@@ -62,5 +62,5 @@ def test_a_class_of_a_cell_is_named_by_its_version_evaluated_and_kept_from_worke
     assert first == again != edited and len(first) == 40
     ended, arms = ast.literal_eval(said[6])
     assert arms == ["none", "mine", "copy"] and sorted(ended) == sorted(2 * [(arm, "done") for arm in arms])
-    assert "cannot be built again in a worker process" in said[7] and "path.py:Class" in said[7]
+    assert "cannot be rebuilt in a worker process" in said[7] and "path.py:Class" in said[7]
     assert "workers=1" in said[7]

@@ -200,7 +200,7 @@ def test_construction_and_import_fail_by_kind(tmp_path) -> None:
     made = make_model(name, steps=4)
     assert made.describe() == {"name": "Made", "steps": 4}
     assert pickle.loads(pickle.dumps(made)).describe() == made.describe()
-    with pytest.raises(ArgumentError, match="only the oracle is handed"):
+    with pytest.raises(ArgumentError, match="only the oracle is given"):
         make_model(write(head.replace("frames=3", "needs=('simulator',)")))
 
 
@@ -287,7 +287,7 @@ def test_a_policy_s_new_process_takes_no_memory_for_one_of_the_old_one_s(tmp_pat
     assert [look(first), look(first), look(second)] == ["look 1, 0 done", "look 2, 0 done", "look 1, 0 done"]
     policy.close()
     new = policy.begin(goal, key)
-    with pytest.raises(RaisedError, match="process has ended since"):
+    with pytest.raises(RaisedError, match="process has ended, and its memory"):
         look(second)
     del first, second
     gc.collect()

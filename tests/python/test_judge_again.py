@@ -159,7 +159,7 @@ def test_a_server_that_stays_dead_is_not_asked_about_every_answer(tmp_path: Path
     with VlmServer(MockClient(model="m")) as server:
         spec = f"rules+llm:{server.url}#m"
     found = wiw.judge(run, spec, progress=False, cache="off", attempts=1, concurrency=2)
-    assert len(found.missing) == count and found.asked < 10 and "answers were not asked about" in found.stopped
+    assert len(found.missing) == count and found.asked < 10 and "answers were not judged" in found.stopped
 
 
 def test_a_model_without_a_name_at_a_dead_server_leaves_the_run_as_it_is(run: Path) -> None:
@@ -232,11 +232,9 @@ def test_judges_go_by_name_and_digest(run: Path) -> None:
     assert low.judge.digest != high.judge.digest
     assert load_run(run, judge=high.judge.digest[:6]).numbers()["warp"].estimates["answer_score"].value == 100
     assert load_run(run, judge="own").numbers()["warp"].estimates["answer_score"].value < 100
-    with pytest.raises(ArgumentError, match=f"2 judges .* name a digest: .*{low.judge.digest}.*{high.judge.digest}"):
+    with pytest.raises(ArgumentError, match=f"2 judges .* give a digest: .*{low.judge.digest}.*{high.judge.digest}"):
         load_run(run, judge="grumpy")
-    with pytest.raises(
-        ArgumentError, match=r"no marks by it. It has those by: rules\+approximate, \w{12} \(the run's own"
-    ):
+    with pytest.raises(ArgumentError, match=r"no marks by it, only by: rules\+approximate, \w{12} \(the run's own"):
         load_run(run, judge="nobody")
 
 
@@ -293,7 +291,7 @@ def test_a_stored_judgement_that_was_edited_is_an_error(run: Path) -> None:
 
 def test_the_command(run: Path, capsys: pytest.CaptureFixture[str], tmp_path: Path) -> None:
     assert main(["judge", str(run)]) == 0
-    assert "0 asked about now" in capsys.readouterr().out, "these are the run's own marks"
+    assert "0 judged now" in capsys.readouterr().out, "these are the run's own marks"
     client = MockClient(lambda call: Completion("", "stop") if "it is night" in said(call) else reply(call), model="m")
     with VlmServer(client) as server:
         arguments = ["judge", str(run), "--llm", server.url, "--model", "m", "--judge-option", "cache=off"]
@@ -302,7 +300,7 @@ def test_the_command(run: Path, capsys: pytest.CaptureFixture[str], tmp_path: Pa
         assert (
             "judge   rules+llm (m), " in shown.out
             and "no marks: warp 2: JudgeError" in shown.err
-            and "same command" in shown.err
+            and "repeat the command" in shown.err
         )
         assert "/7 answers" in shown.err, "progress is shown, also where there is no terminal"
         client.script = reply
@@ -316,8 +314,8 @@ def test_the_command(run: Path, capsys: pytest.CaptureFixture[str], tmp_path: Pa
     ("flags", "expected"),
     [
         (["--judge", "rules", "--llm", "http://localhost:1/v1"], "--llm is short for --judge rules"),
-        (["--model", "m"], "expected a language model without a name"),
-        (["--judge", "llm:http://localhost:1/v1#m", "--model", "m"], "expected a language model without a name"),
+        (["--model", "m"], "expected a language model given without a name"),
+        (["--judge", "llm:http://localhost:1/v1#m", "--model", "m"], "expected a language model given without a name"),
         (["--judge", "coin"], "judge 'coin': expected rules"),
         (["--judge-option", "temperature=1"], "options temperature are of language models only"),
     ],

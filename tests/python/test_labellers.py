@@ -74,7 +74,7 @@ def test_the_oracle_needs_ids_of_its_scene() -> None:
         oracle.label(blank(IDS), FIELD)
     with pytest.raises(ArgumentError, match="got uint32 \\(1, 2, 2\\)"):
         oracle.label(blank(IDS), FIELD, IDS[:, :, :2])
-    with pytest.raises(ArgumentError, match="ids up to 5, got 6: views of another scene"):
+    with pytest.raises(ArgumentError, match="ids up to 5, got 6: these views are of another scene"):
         oracle.label(blank(IDS), FIELD, IDS + 1)
 
 
@@ -141,7 +141,7 @@ def test_the_surest_detection_is_on_top() -> None:
         np.testing.assert_allclose(found.confidence[view], np.array([0, 0.5, 0.9], np.float32)[expected])
     assert not found.state.any() and not labeller.privileged
     assert labeller.describe()["detector"] == "Squares"
-    with pytest.raises(ArgumentError, match="1 to 255 names that differ"):
+    with pytest.raises(ArgumentError, match="1 to 255 distinct names"):
         DetectorLabeller(Squares(), Whole(), ("chair", "chair"))
 
 
@@ -271,7 +271,7 @@ def test_weights_are_stored_and_checked(tmp_path: Path, small: LearnedLabeller) 
     assert once.describe()["digest"] == again.describe()["digest"]
     assert once.describe()["digest"] != LearnedLabeller.of(small_network(1), CARD).describe()["digest"]
     file.write_bytes(file.read_bytes()[:-10])
-    with pytest.raises(WeightsError, match="expected weights of perception, whole"):
+    with pytest.raises(WeightsError, match="expected complete weights of perception"):
         LearnedLabeller(file)
     with pytest.raises(WeightsError, match="wiw train perception"):
         LearnedLabeller(tmp_path / "nothing")

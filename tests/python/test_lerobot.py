@@ -326,7 +326,7 @@ def test_the_command_line(navigation: Path, tmp_path: Path, capsys: pytest.Captu
     printed = capsys.readouterr()
     assert f"written   {out}" in printed.out and "episodes: " in printed.err
     assert main(["data", "export", str(navigation), "--out", out]) == 2
-    assert "holds something already" in capsys.readouterr().err
+    assert "is not empty" in capsys.readouterr().err
     assert main(["data", "import", out, "--out", back]) == 0
     assert main(["data", "verify", back]) == 0
     assert capsys.readouterr().out.endswith("sound\n")
@@ -379,14 +379,14 @@ def write(file: str, text: str) -> Callable[[Path], None]:
     ("damage", "words"),
     [
         (edit_info(codebase_version="v2.1"), "format v3.0, got v2.1"),
-        (edit_info(fps=30), "expected 30 frames a second .* timestamps of 5"),
+        (edit_info(fps=30), "expected 30 frames per second .* timestamps of 5"),
         (edit_info(total_episodes=99), "expected 99 episodes .* got "),
         (edit_info(data_path="data/{episode}.parquet"), "data_path of chunk_index and file_index"),
         (edit_info(features={}), "got no observation.state"),
         (edit_feature(RGB, dtype="video"), "as image .* got video .* no longer exact"),
         (edit_feature(DEPTH, shape=[8, 8, 1]), r"as image \[36, 64, 1\], got image \[8, 8, 1\]"),
-        (lambda folder: (folder / "meta/info.json").unlink(), "info.json is missing"),
-        (lambda folder: (folder / "meta/wiw.json").unlink(), "wiw.json is missing; expected .* `wiw data export`"),
+        (lambda folder: (folder / "meta/info.json").unlink(), "info.json does not exist"),
+        (lambda folder: (folder / "meta/wiw.json").unlink(), "wiw.json does not exist; expected .* `wiw data export`"),
         (lambda folder: (folder / EPISODE_FILE).unlink(), "episodes as meta/info.json says, got 0"),
         (lambda folder: (folder / FRAME_FILE).unlink(), "file-000.parquet is missing"),
         (drop_column(FRAME_FILE, "T_world_camera"), "expected columns .* got no T_world_camera"),
@@ -394,7 +394,7 @@ def write(file: str, text: str) -> Callable[[Path], None]:
         (drop_column(EPISODE_FILE, "scene"), "got no scene"),
         (set_column(EPISODE_FILE, "file", "../elsewhere.parquet"), "in the new folder, got ../elsewhere"),
         (set_column(EPISODE_FILE, "file", "/elsewhere.parquet"), "in the new folder, got /elsewhere"),
-        (set_column(FRAME_FILE, RGB, None), f"pictures of {RGB} in it, got some missing"),
+        (set_column(FRAME_FILE, RGB, None), f"images of {RGB} in it, but some are missing"),
         (set_column(FRAME_FILE, "index", 3), "expected frames 0 to .* of episode 0, got others"),
         (cut_short(FRAME_FILE), "got a damaged one"),
         (cut_short(EPISODE_FILE), "damaged file"),
@@ -414,7 +414,7 @@ def test_what_cannot_be_imported_is_told(
     damage(folder)
     with pytest.raises(FileError, match=words):
         import_lerobot(folder, tmp_path / "out")
-    assert sorted(path.name for path in tmp_path.iterdir()) == ["bad"], "nothing half-written is left"
+    assert sorted(path.name for path in tmp_path.iterdir()) == ["bad"], "no partial file is left"
 
 
 def test_depth_that_is_no_depth_is_told(exported: Path, tmp_path: Path) -> None:
@@ -425,19 +425,19 @@ def test_depth_that_is_no_depth_is_told(exported: Path, tmp_path: Path) -> None:
 
 
 def test_what_cannot_be_exported_is_told(navigation: Path, manipulation: Path, tmp_path: Path) -> None:
-    with pytest.raises(FileError, match=r"manifest\.json is missing"):
+    with pytest.raises(FileError, match=r"manifest\.json does not exist"):
         export_lerobot(tmp_path / "nothing", tmp_path / "out")
-    with pytest.raises(ArgumentError, match="1 frame a second or more, got 0"):
+    with pytest.raises(ArgumentError, match="at least 1 frame per second, got 0"):
         export_lerobot(navigation, tmp_path / "out", fps=0)
     with pytest.raises(ArgumentError, match="1 worker or more, got 0"):
         export_lerobot(navigation, tmp_path / "out", workers=0)
     begun = shutil.copytree(navigation, tmp_path / "begun")
     (begun / "meta.json").unlink()
-    with pytest.raises(FileError, match="repeat `wiw collect navigation` until it is finished"):
+    with pytest.raises(FileError, match="repeat that command until it finishes"):
         export_lerobot(begun, tmp_path / "out")
     (tmp_path / "full").mkdir()
     (tmp_path / "full" / "mine").write_text("kept")
-    with pytest.raises(FileError, match="holds something already"):
+    with pytest.raises(FileError, match="is not empty"):
         export_lerobot(manipulation, tmp_path / "full")
     assert contents(tmp_path / "full") == {"mine": b"kept"} and not (tmp_path / "out").exists()
 

@@ -197,7 +197,7 @@ def test_an_observation_without_the_depth_that_is_needed_is_named(task: ImageNav
     env = task.environment()
     observation, info = env.reset()
     for agent in (wiw.Agent("matcher"), wiw.Agent("heuristic", "warp", reviser="matcher")):
-        with pytest.raises(ArgumentError, match="make the environment with depth=True"):
+        with pytest.raises(ArgumentError, match="create the environment with depth=True"):
             agent.decide(observation, env.goal, key=info["key"])
 
 
@@ -303,7 +303,7 @@ def test_models_are_refused_that_ask_for_what_nobody_gives() -> None:
 
     for declared, said in [
         ({"needs": ("depth", "semantic")}, "needs semantic"),
-        ({"needs": ("simulator",)}, "oracle alone"),
+        ({"needs": ("simulator",)}, "only the oracle"),
         ({"space": "pose7"}, "discrete primitives"),
         ({"needs": ("depth",), "frames": 4}, "have up to 5"),
     ]:

@@ -294,8 +294,11 @@ def test_results_do_not_depend_on_who_else_is_live(tmp_path: Path) -> None:
     [
         ({"model": "warp"}, "this agent plans in poses of a gripper"),
         ({"model": Spy(control="action", space="pose7", view="panorama")}, "imagines panoramas"),
-        ({"model": Spy(control="viewpoint", space="pose7")}, "move none"),
-        ({"model": "copy", "depth": 2}, "proposes from imagined places, but poses of a gripper lead to none"),
+        ({"model": Spy(control="viewpoint", space="pose7")}, "do not move the camera"),
+        (
+            {"model": "copy", "depth": 2},
+            "proposes plans from imagined places, but poses of a gripper do not lead to other places",
+        ),
         ({"model": "copy", "reviser": "heuristic"}, "plans in poses of a gripper, but the reviser"),
     ],
 )
@@ -306,7 +309,7 @@ def test_what_poses_cannot_have_is_refused(options: Any, said: str) -> None:
 
 def test_a_shuffled_placebo_of_poses_is_refused() -> None:
     """As soon as a run composes it; one that is composed by hand, at its first decision."""
-    refusal = "deals primitives anew, and these plans are made of none; use 'swapped'"
+    refusal = "reshuffles primitives, but these plans contain none; use 'swapped'"
     with pytest.raises(ArgumentError, match=refusal):
         AgentRecipe(Reacher(), "copy", placebo="shuffled").build(RunContext(DotTask()))
     agent = wiw.Agent(Reacher(), ShuffledPlacebo(wiw.world_model("copy", space="pose7")))
@@ -314,6 +317,14 @@ def test_a_shuffled_placebo_of_poses_is_refused() -> None:
     observation = env.begin(DotTask().episodes(1)[0])
     with pytest.raises(ArgumentError, match=refusal):
         agent.decide(observation, env.goal, Key(0, 0))
+
+
+def test_a_task_without_a_wrist_camera_refuses_a_policy_that_needs_one() -> None:
+    class ByWrist(Reacher):
+        needs = ("wrist",)
+
+    with pytest.raises(ArgumentError, match="task 'dot' does not have"):
+        wiw.evaluate(DotTask(), wiw.Agent(ByWrist()), 1, progress=False)
 
 
 def test_plans_of_poses_are_judged_by_the_truth() -> None:

@@ -69,7 +69,7 @@ def test_imagination_is_measured_against_a_fork(run: Path) -> None:
 
 def test_a_run_is_verified_compared_and_exported(run: Path, tmp_path: Path, capsys: Any) -> None:
     assert main(["verify", str(run), "--episodes", "2"]) == 0
-    assert "all as recorded" in capsys.readouterr().out
+    assert "everything is as recorded" in capsys.readouterr().out
     assert main(["compare", str(run), str(run)]) == 0
     assert main(["export", str(run), "--csv", str(tmp_path / "tables")]) == 0
 
@@ -126,15 +126,15 @@ def test_a_run_that_was_stopped_goes_on(run: Path, tmp_path: Path, monkeypatch: 
 @pytest.mark.parametrize(
     ("flags", "said"),
     [
-        (["--scenes", "apartments:val"], "scenes: this is for tasks in which an agent walks"),
-        (["--motion", "slide"], "motion: this is for"),
-        (["--per-scene", "2"], "per_scene: this is for"),
-        (["--episode-file", "x.json", "--scene-folder", "y"], "episode_file, scene_folder: this is for"),
+        (["--scenes", "apartments:val"], "scenes: only for tasks in which an agent walks"),
+        (["--motion", "slide"], "motion: only for"),
+        (["--per-scene", "2"], "per_scene: only for"),
+        (["--episode-file", "x.json", "--scene-folder", "y"], "episode_file, scene_folder: only for"),
         (["--tasks", "juggle"], "push_buttons, slide_block, insert_peg, stack_cups, got juggle"),
         (["--tasks", "slide_block,slide_block"], "different ones"),
-        (["--preset", "official"], "there are default, paper"),
+        (["--preset", "official"], "choose from default, paper"),
         (["--task-option", "actions=0"], "must be positive"),
-        (["--task-option", "decisions=3"], "unknown rule 'decisions'; there are actions"),
+        (["--task-option", "decisions=3"], "unknown rule 'decisions'; expected one of actions"),
     ],
 )
 def test_what_does_not_apply_is_refused(flags: list[str], said: str, tmp_path: Path, capsys: Any) -> None:
@@ -147,7 +147,7 @@ def test_other_tasks_have_no_tasks(capsys: Any) -> None:
     assert main(["run", "imagenav", "--tasks", "push_buttons", "--policy", "heuristic"]) == 2
     assert "unknown rule 'tasks'" in capsys.readouterr().err
     assert main(["episodes", "manipulation"]) == 2
-    assert "a function of the seed" in capsys.readouterr().err
+    assert "determined by the seed" in capsys.readouterr().err
 
 
 def test_a_run_has_as_many_episodes_as_the_preset_says(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

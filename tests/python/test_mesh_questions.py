@@ -237,7 +237,7 @@ def test_a_file_for_another_scene_is_refused(house, name, fields, wrong):
 
 def test_attributes_are_for_scenes_that_tell_little(tmp_path):
     (tmp_path / "more.json").write_text("{}")
-    with pytest.raises(ArgumentError, match="apartments tell everything"):
+    with pytest.raises(ArgumentError, match="apartments need none"):
         AEQA("apartments:val/3", attributes=tmp_path / "more.json")
 
 

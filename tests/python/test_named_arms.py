@@ -82,23 +82,23 @@ def test_arms_share_the_options_of_their_agent_and_have_their_own(shade):
 @pytest.mark.parametrize(
     ("arms", "message"),
     [
-        (["a=copy", "a=warp"], r"different world models, got \['a', 'a'\]; .*names of their own: big="),
+        (["a=copy", "a=warp"], r"different world models, got \['a', 'a'\]; .*name them: big="),
         (["warpnet?weights=a", "warpnet?weights=b"], r"got \['warpnet', 'warpnet'\]; .*big=warpnet\?weights="),
-        (["=copy"], "expected a name without spaces around it, got '' in '=copy'"),
-        (["a/b=copy"], "name 'a/b' in 'a/b=copy' has the character '/'"),
+        (["=copy"], "expected a name without surrounding spaces, got '' in '=copy'"),
+        (["a/b=copy"], "name 'a/b' in 'a/b=copy' contains '/'"),
         (["a="], "expected NAME=MODEL"),
         (["a=warpnet?"], "expected NAME=MODEL"),
         (["a=warpnet?weights=x&"], "expected NAME=MODEL"),
         (["a=warpnet?weights"], "expected KEY=VALUE, got 'weights'"),
         (["a=warpnet?weights=x&weights=y"], "'weights' is given twice"),
-        (["a=none?steps=3"], "has options and no world model"),
-        (["oracle=warp"], "reports take the arm 'oracle' for the reference"),
+        (["a=none?steps=3"], "has options but no named world model"),
+        (["oracle=warp"], "the name 'oracle' is reserved for the reference"),
         (["copy=placebo-shuffled:copy"], "choose another name"),
-        ({"": "copy"}, "expected a name without spaces"),
-        ({" a": "copy"}, "expected a name without spaces"),
-        ({"a,b": "copy"}, "has the character ','"),
-        ({"a\nb": "copy"}, "has the character"),
-        ({"a": "b=copy"}, "has the names 'a' and 'b'"),
+        ({"": "copy"}, "expected a name without surrounding spaces"),
+        ({" a": "copy"}, "expected a name without surrounding spaces"),
+        ({"a,b": "copy"}, "contains ','"),
+        ({"a\nb": "copy"}, "contains"),
+        ({"a": "b=copy"}, "is named both 'a' and 'b'"),
     ],
 )
 def test_wrong_arms_are_refused_with_a_hint(arms, message):
@@ -128,6 +128,6 @@ def test_two_checkpoints_of_one_model_are_two_arms_of_a_run(shade, two_rooms, tm
     assert main(["resume", "run", "--no-report"]) == 0
     capsys.readouterr()
     assert main([*task, "--arms", "a=warp,a=copy", "--out", "wrong"]) == 2
-    assert "names of their own" in capsys.readouterr().err and not (tmp_path / "wrong").exists()
+    assert "name them:" in capsys.readouterr().err and not (tmp_path / "wrong").exists()
     with pytest.raises(RegistryError, match="unexpected keyword"):
         wiw.evaluate("imagenav", AgentRecipe("heuristic"), 1, scenes=two_rooms, arms=["a=copy?speed=3"], out="wrong")

@@ -125,13 +125,13 @@ def other_pictures(segment: NavigationSegment) -> Any:
         (change_first(poses=lambda each: shift(each.poses)), "frame: .*frame 3 is not where action"),
         (change_first(rolls=lambda each: each.rolls + 1), "frame: .*expected a roll by"),
         (change_first(sources=lambda each: each.sources[::-1].copy()), "frame: .*expected each source"),
-        (change_first(encoded_images=lambda each: (None,) * len(each)), "frame: .*expected a picture in each frame"),
+        (change_first(encoded_images=lambda each: (None,) * len(each)), "frame: .*expected an image in each frame"),
         (change_first(encoded_images=lambda each: (b"none", *each.encoded_images[1:])), "picture: .*frame 0"),
-        (change_first(encoded_images=other_pictures), r"picture: .*expected pictures of \(36, 64\)"),
+        (change_first(encoded_images=other_pictures), r"picture: .*expected images of \(36, 64\)"),
         (lambda segments, rows: segments.pop(), "file: .*expected .* row groups"),
         (recount, "frame: .*expected forward .* as in segments.parquet"),
         (rename_scene, "split: .*apartments:val/3 is of split val"),
-        (split_scene, "leak: .*pictures are in two_rooms .* and in twin"),
+        (split_scene, "leak: .*images are in two_rooms .* and in twin"),
     ],
 )
 def test_what_is_wrong_is_found(copied: Path, change: Any, words: str | None) -> None:
@@ -246,7 +246,7 @@ def test_the_command_line(tmp_path: Path, two_rooms: str, capsys: pytest.Capture
     printed = capsys.readouterr()
     assert "segments of 1 scenes" in printed.out and "scenes: 1/1, " in printed.err
     assert main([*asked, "--out", str(out), "--preset", "paper"]) == 2
-    assert "holds another collection" in capsys.readouterr().err
+    assert "holds a different collection" in capsys.readouterr().err
     assert main(["data", "stats", str(out)]) == 0
     printed = capsys.readouterr()
     assert "windows of 14 frames" in printed.out and "two_rooms" in printed.out and "forward" in printed.out

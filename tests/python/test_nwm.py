@@ -342,7 +342,7 @@ def test_weights_that_do_not_fit_are_named(weights: Path, tmp_path: Path, monkey
             NWM(weights=str(file), vae=vae, device="cpu")
 
     refused({"model": state}, "key 'ema', found model")
-    refused({"ema": {"weight": torch.zeros(1)}}, "no weights of a CDiT: there is no 'pos_embed'; it holds weight")
+    refused({"ema": {"weight": torch.zeros(1)}}, "not weights of a CDiT: expected 'pos_embed'; it has weight")
     refused({"ema": {n: v for n, v in state.items() if "bias_k" not in n}}, r"2 missing: blocks.0.cttn.bias_k")
     refused({"ema": {**state, "extra": torch.zeros(1)}}, "1 unknown: extra")
     refused({"ema": {**state, "t_embedder.mlp.2.bias": torch.zeros(3)}}, r"mlp.2.bias \(3,\) for \(24,\)")
@@ -362,7 +362,7 @@ def test_weights_that_do_not_fit_are_named(weights: Path, tmp_path: Path, monkey
         NWM(weights=str(weights), vae=str(partial.parent), device="cpu")
     monkeypatch.setenv("HF_HUB_OFFLINE", "1")
     monkeypatch.setattr("huggingface_hub.constants.HF_HUB_OFFLINE", True)
-    with pytest.raises(WeightsError, match="hub is out of reach"):
+    with pytest.raises(WeightsError, match="hub cannot be reached"):
         NWM(weights="nobody/nothing", vae=vae, device="cpu")
     with pytest.raises(WeightsError, match="no AutoencoderKL in"):
         NWM(weights=str(weights), vae=str(tmp_path / "nowhere"), device="cpu")

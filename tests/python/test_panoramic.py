@@ -262,7 +262,7 @@ def test_bad_rows_are_refused_and_the_server_goes_on(name: str, se3ds: Served) -
 
 BAD_MESSAGES: dict[str, Callable[[], Any]] = {
     "text": lambda: "hello",
-    "no msgpack": lambda: b"\xc1",
+    "not valid msgpack": lambda: b"\xc1",
     "no map": lambda: msgpack.packb([1]),
     "another version": lambda: ask(b"", v=2),
     "unknown type": lambda: ask(b"", type="answer"),
@@ -312,7 +312,7 @@ def test_sigterm_ends_it(official: Path) -> None:
         (["--code", "/nowhere"], "git clone https://github.com/google-research/se3ds"),
         (["--weights", "/nowhere"], "expected one checkpoint se3ds_ckpt.index"),
         (["--host", "0.0.0.0"], "WIW_TOKEN"),
-        (["--noise"], "draws nothing at random"),
+        (["--noise"], "has no randomness"),
     ],
 )
 def test_a_wrong_start_says_what_to_do(official: Path, change: list[str], told: str) -> None:

@@ -205,7 +205,7 @@ def test_what_placebo_arms_are_of() -> None:
 
 def test_a_placebo_of_poses_is_refused_when_it_is_composed() -> None:
     context = RunContext(Manipulation("push_buttons"))
-    with pytest.raises(ArgumentError, match="deals primitives anew, and these plans are made of none; use 'swapped'"):
+    with pytest.raises(ArgumentError, match="reshuffles primitives, but these plans contain none; use 'swapped'"):
         AgentRecipe(Pressing(), "copy", placebo="shuffled").build(context)
 
 
@@ -270,10 +270,10 @@ def test_a_swap_needs_another_episode(two_rooms, tmp_path) -> None:
 @pytest.mark.parametrize(
     ("command", "said"),
     [
-        (["ar", "--episodes", "1", "--arms", "none,placebo-swapped"], "expected at least 2 episodes, got 1"),
+        (["ar", "--episodes", "1", "--arms", "none,placebo-swapped"], "so it needs at least 2 episodes; got 1"),
         (
             ["manipulation", "--world-model", "armnet", "--arms", "none,placebo-shuffled"],
-            "these plans are made of none",
+            "these plans contain none",
         ),
     ],
 )

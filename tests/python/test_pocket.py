@@ -217,7 +217,7 @@ def test_a_saved_network_is_loaded_again_and_anything_else_refused(tmp_path: Pat
     file.write_bytes(file.read_bytes().replace(b"wiw-pocket-1", b"wiw-pocket-9"))
     with pytest.raises(WeightsError, match="another version; `wiw train pocket`"):
         Pocket(file)
-    with pytest.raises(WeightsError, match="`wiw train pocket` makes some"):
+    with pytest.raises(WeightsError, match="`wiw train pocket` creates one"):
         Pocket(tmp_path / "none")
 
 

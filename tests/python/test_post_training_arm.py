@@ -161,12 +161,12 @@ def test_sizes_are_those_of_the_paper(demos: Path) -> None:
 
 def test_corpora_that_do_not_fit_are_refused(demos: Path, weights: Any, tmp_path: Path) -> None:
     options: dict[str, Any] = {"device": "cpu", "part": "all"}
-    with pytest.raises(ArgumentError, match="nwm-action follows an agent that moves, but in this dataset a gripper"):
+    with pytest.raises(ArgumentError, match="nwm-action follows a moving agent, but this dataset is of a gripper"):
         post_train("nwm-action", demos, tmp_path / "out", recipe=tiny_recipe("nwm-action"), **options)
     mirrored = tiny_recipe("svd-action", mirror=0.5)
-    with pytest.raises(ArgumentError, match="the mirror image of an arm is another arm"):
+    with pytest.raises(ArgumentError, match="the mirror image of a robot arm is a different arm"):
         post_train("svd-action", demos, tmp_path / "out", recipe=mirrored, **options)
-    with pytest.raises(FileError, match=r"meta.json is missing"):
+    with pytest.raises(FileError, match=r"meta.json does not exist"):
         post_train("svd-action", tmp_path, tmp_path / "out", recipe=tiny_recipe("svd-action"), **options)
 
 
@@ -181,7 +181,7 @@ def test_a_state_of_another_corpus_is_refused(demos: Path, weights: Any, tmp_pat
 
     with pytest.raises(KeyboardInterrupt):
         post_train(name, demos, out, seconds=0, on_step=stop, **options)
-    with pytest.raises(ArgumentError, match="other data or options"):
+    with pytest.raises(ArgumentError, match="different data or options"):
         post_train(name, save_dataset(tmp_path / "data"), out, **options)
 
 
@@ -273,9 +273,9 @@ def test_validation_on_what_is_trained_on_or_of_another_kind_is_refused(
 ) -> None:
     with pytest.raises(ArgumentError, match="expected demonstrations that are not trained on, got push_buttons"):
         train(tmp_path / "same", part="all", validation=demos)
-    with pytest.raises(ArgumentError, match=r"`wiw collect manipulation`, .* is of `wiw collect navigation`"):
+    with pytest.raises(ArgumentError, match=r"`wiw collect manipulation`, .* is from `wiw collect navigation`"):
         train(tmp_path / "moves", validation=save_dataset(tmp_path / "data"))
-    with pytest.raises(ArgumentError, match="decisions: those of `wiw collect decisions` are an agent's that moves"):
+    with pytest.raises(ArgumentError, match="decisions: those of `wiw collect decisions` are for a moving agent"):
         train(tmp_path / "decisions", decisions=tmp_path / "d.parquet")
     with pytest.raises(ArgumentError, match=r"no demonstration of .* is held out; collect more demonstrations"):
         train(tmp_path / "none", numbers={"held_out": 0.0})

@@ -293,7 +293,10 @@ def test_a_dry_run_prints_torchruns_command(capsys: pytest.CaptureFixture[str]) 
 @pytest.mark.parametrize(
     ("arguments", "said"),
     [
-        (["ltx-action", "--data", "data", "--gpus", "3"], "16 passes of 1, which 3 processes cannot share out"),
+        (
+            ["ltx-action", "--data", "data", "--gpus", "3"],
+            "16 passes of 1, which cannot be split evenly among 3 processes",
+        ),
         (["ltx-action", "--gpus", "2"], "ltx-action trains on a dataset"),
         (["ltx-action", "--data", "data", "--gpus", "0"], "expected --gpus of at least 1, got 0"),
         (
@@ -331,12 +334,14 @@ def test_processes_of_torchrun_start_no_others(
 def test_options_of_a_job_are_refused_where_there_is_none(capsys: pytest.CaptureFixture[str]) -> None:
     assert main(["train", "ltx-action", "--data", "data", "--hours", "3", "--account", "lab"]) == 2
     said = " ".join(capsys.readouterr().err.split())
-    assert "--hours, --account: of a SLURM job; name its --partition" in said
+    assert "--hours, --account: only for SLURM jobs; name a --partition" in said
 
 
 def test_passes_are_shared_out_evenly_or_not_at_all() -> None:
     require_equal_shares(16, 4, 2)
-    with pytest.raises(ArgumentError, match="16 clips has 4 passes of 4, which 8 processes cannot share out"):
+    with pytest.raises(
+        ArgumentError, match="16 clips has 4 passes of 4, which cannot be split evenly among 8 processes"
+    ):
         require_equal_shares(16, 4, 8)
 
 
@@ -347,7 +352,7 @@ def test_each_process_has_its_own_gpu(monkeypatch: pytest.MonkeyPatch) -> None:
     for own in ("0", "1"):
         monkeypatch.setenv("LOCAL_RANK", own)
         distributed.require_own_gpu("cuda")
-    with pytest.raises(ArgumentError, match="expected cuda, of which each process takes its own, got cuda:1"):
+    with pytest.raises(ArgumentError, match="expected cuda, as each process takes its own GPU, got cuda:1"):
         distributed.require_own_gpu("cuda:1")
     monkeypatch.setenv("LOCAL_RANK", "2")
     distributed.require_own_gpu("cpu")

@@ -170,7 +170,10 @@ def test_8_bit_adam_is_near_adam_and_resumes_exactly(data: Path, weights: Any) -
 def test_8_bit_adam_that_is_not_installed_is_told(data: Path, weights: Any, monkeypatch: pytest.MonkeyPatch) -> None:
     found = importlib.util.find_spec
     monkeypatch.setattr(importlib.util, "find_spec", lambda name: None if name == "bitsandbytes" else found(name))
-    with pytest.raises(DependencyError, match=r"optimizer=adamw8bit needs; pip install 'wiw\[lowbit\]'"):
+    with pytest.raises(
+        DependencyError,
+        match=r"optimizer=adamw8bit needs bitsandbytes, which is not installed; pip install 'wiw\[lowbit\]'",
+    ):
         make_trainer("nwm-action", data, weights("nwm-action"), optimizer="adamw8bit")
 
 

@@ -169,7 +169,7 @@ def test_a_log_forgets_what_comes_later_and_half_a_line(tmp_path: Path) -> None:
     log.rewind(2)
     assert [line["loss"] for line in log.read()] == [0.5, 1.0] and log.path.read_text().endswith("}\n")
     log.path.write_text("loss\n")
-    with pytest.raises(FileError, match="a JSON object a line"):
+    with pytest.raises(FileError, match="one JSON object per line"):
         log.read()
 
 

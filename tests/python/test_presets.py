@@ -72,14 +72,14 @@ def test_a_file_of_ones_own_starts_from_a_shipped_preset(tmp_path: Path) -> None
 @pytest.mark.parametrize(
     ("text", "error", "message"),
     [
-        ("decisons: 4", ArgumentError, r"own.yaml: unknown rule 'decisons'; there are decisions, candidates"),
+        ("decisons: 4", ArgumentError, r"own.yaml: unknown rule 'decisons'; expected one of decisions, candidates"),
         ("decisions: many", ArgumentError, r"own.yaml: decisions: expected a whole number, got 'many'"),
         ("decisions: 2.5", ArgumentError, "decisions: expected a whole number"),
         ("decisions: true", ArgumentError, "decisions: expected a whole number"),
         ("motion: fly", ArgumentError, "motion: expected one of refuse, slide, got 'fly'"),
         ("radius: wide", ArgumentError, "radius: expected a number"),
         ("horizon: 0", ArgumentError, "must be positive"),
-        ("generator: 3", ArgumentError, "own.yaml: generator: expected rules of generated episodes"),
+        ("generator: 3", ArgumentError, "own.yaml: generator: expected rules for generated episodes"),
         ("generator: {nearby: 3}", ArgumentError, "unknown rule 'nearby'"),
         ("policy: [navigator]", ArgumentError, "policy: expected the name of a policy"),
         ("base: mine", ArgumentError, "base 'mine' is not one of default, paper, foresight, official"),
@@ -94,7 +94,7 @@ def test_what_is_wrong_in_a_file_is_named(tmp_path: Path, text: str, error: type
 
 def test_a_preset_that_is_not_there_is_named(tmp_path: Path) -> None:
     with pytest.raises(
-        ArgumentError, match=r"no preset 'offical'; there are default, paper, foresight, official, or give the path"
+        ArgumentError, match=r"no preset 'offical'; choose from default, paper, foresight, official, or give the path"
     ):
         ImageNav(preset="offical")
     with pytest.raises(FileError, match=r"none\.yaml"):

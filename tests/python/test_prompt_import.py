@@ -16,7 +16,7 @@ from wiw.cli import main
 from wiw.errors import FileError, PromptError
 from wiw.policies.vlm.prompt_import.latex import convert_latex
 from wiw.policies.vlm.prompt_import.sources import name_template, read_source
-from wiw.policies.vlm.prompts import FOLDER, SETS, Prompts, get_slots, list_tasks
+from wiw.policies.vlm.prompts.templates import FOLDER, SETS, Prompts, get_slots, list_tasks
 from wiw.vlm.template_worker import ENVIRONMENT
 
 BOX = "\\begin{tcolorbox}[\n  breakable,\n  title=%s,\n  colback=red!5\n]\n%s\n\\end{tcolorbox}\n"
@@ -123,9 +123,9 @@ def test_a_checkout_is_read_and_not_run(tmp_path: Path) -> None:
     [
         ("AR Planner Prompt", r"\{obs\_key\}", "lacks look_ahead_action_num"),
         ("AR Planner Prompt", r"\{room\}", "unknown slot 'room' in the prompt for ar/planner; expected obs_key"),
-        ("AR Answerer Prompt", r"What is \weird{it}?", r"main\.tex:7: command \\weird is not known"),
-        ("AR Answerer Prompt", r"\begin{tabular}", "environment 'tabular' is not known"),
-        ("AR Answerer Prompt", r"\textbf{What", "a brace or a list does not end"),
+        ("AR Answerer Prompt", r"What is \weird{it}?", r"main\.tex:7: unknown command \\weird"),
+        ("AR Answerer Prompt", r"\begin{tabular}", "unknown environment 'tabular'"),
+        ("AR Answerer Prompt", r"\textbf{What", "a brace or a list is not closed"),
         ("AR Answerer Prompt", r"\item x", r"\\item outside a list"),
         ("AR Answerer Prompt", "% nothing", "the prompt for ar/answerer is empty"),
         ("Manipulation Planner Prompt", HANDS + r"\{\}", "expected 5 slots {} in the prompt .* found more"),
@@ -151,7 +151,7 @@ def test_a_box_in_a_comment_is_passed_over(tmp_path: Path) -> None:
 
 def test_folders_that_will_not_do_are_refused(tmp_path: Path) -> None:
     source = write_paper(tmp_path, ("AR Answerer Prompt", "What?"))
-    with pytest.raises(FileError, match="expected a folder that is new or empty"):
+    with pytest.raises(FileError, match="expected a new or empty folder"):
         wiw.import_prompts(source, tmp_path)
     with pytest.raises(PromptError, match="no such file or folder"):
         wiw.import_prompts(tmp_path / "none", tmp_path / "own")

@@ -209,9 +209,9 @@ BAD = {
     "partial": ("i < 3 and " + GOOD, "ended with 3 of 4 images answered"),
     "malformed": (
         "print('loading weights', flush=True)",
-        "'loading weights'; anything else belongs on the standard error",
+        "'loading weights'; print anything else to standard error",
     ),
-    "unknown": ("print(json.dumps({'path': 'x', 'scores': {}}), flush=True)", "'x', which it was not asked about"),
+    "unknown": ("print(json.dumps({'path': 'x', 'scores': {}}), flush=True)", "'x', which was not requested"),
     "repeated": (f"[{GOOD} for _ in range(2)]", "scored .* twice"),
     "names": (
         "print(json.dumps({'path': p, 'scores': {'musiq': 1}}), flush=True)",
@@ -252,7 +252,7 @@ def test_what_cannot_be_run_is_said(tmp_path: Path) -> None:
     with pytest.raises(ScorerError, match="cannot be run") as caught:
         make_scorer("no-such-scorer --fast")
     assert caught.value.kind == "missing"
-    with pytest.raises(ScorerError, match="ended without saying who it is"):
+    with pytest.raises(ScorerError, match="ended without identifying itself"):
         make_scorer("true")
     for spec, said in (("", "got nothing"), ("'open", "quote it as in a shell")):
         with pytest.raises(ArgumentError, match=said):
@@ -501,7 +501,7 @@ def test_what_cannot_be_compared_is_refused(
     ):
         with pytest.raises(ArgumentError, match=said):
             wiw.quality(run, **options)
-    with pytest.raises(ArgumentError, match="a name that is taken"):
+    with pytest.raises(ArgumentError, match="a name that is already taken"):
         card = CARD.replace("aesthetic", "sharpness")
         wiw.quality(run, [write_scorer(tmp_path, card=card)], frames=4)
     with pytest.raises(ArgumentError, match="expected different runs"):

@@ -18,7 +18,7 @@ from wiw import scenes
 from wiw.datasets import episodes as episode_file
 from wiw.datasets.cameras import camera_pose
 from wiw.datasets.questions import Question, balance, blind, generate, grammar, parse, phrase, twins
-from wiw.datasets.questions.answers import LOOKED_FOR, Fact, differ, find_answer, propose
+from wiw.datasets.questions.answers import LOOKED_FOR, Fact, are_different, find_answer, propose
 from wiw.datasets.questions.colors import name_colors
 from wiw.datasets.questions.facts import BROADER, SMALL, Room, SceneTable, Thing
 from wiw.datasets.questions.generate import EpisodeRules
@@ -83,9 +83,9 @@ def test_foreign_texts_are_not_parsed(text: str) -> None:
         ("where", {}, "has the slots object"),
         ("where", {"object": "vase", "room": "kitchen"}, "has the slots object"),
         ("where", {"object": "white board"}, "alone"),
-        ("where", {"object": "key on the wall"}, "told from"),
-        ("activity", {"activity": "fly"}, "told from"),
-        ("count_in", {"objects": "books", "room": "kitchen"}, "told from"),
+        ("where", {"object": "key on the wall"}, "distinguished from"),
+        ("activity", {"activity": "fly"}, "distinguished from"),
+        ("count_in", {"objects": "books", "room": "kitchen"}, "distinguished from"),
     ],
 )
 def test_words_that_cannot_be_found_again_are_refused(template: str, slots: dict[str, str], message: str) -> None:
@@ -358,7 +358,7 @@ def test_episodes_of_one_scene_take_turns_in_categories() -> None:
 
 
 def test_a_scene_without_rooms_is_a_typed_error(two_rooms: str) -> None:
-    with pytest.raises(ArgumentError, match="tells its rooms"):
+    with pytest.raises(ArgumentError, match="expected a scene with rooms"):
         generate.generate(world(two_rooms, "cpu"), 1, 0)
 
 
@@ -407,10 +407,10 @@ def test_too_few_scenes_are_a_typed_error() -> None:
 
 
 def test_adjacent_colors_and_other_corners_of_a_room_are_no_different_answers() -> None:
-    assert not differ(Fact("white", (), ()), Fact("grey", (), ()), "color")
-    assert differ(Fact("white", (), ()), Fact("blue", (), ()), "color")
+    assert not are_different(Fact("white", (), ()), Fact("grey", (), ()), "color")
+    assert are_different(Fact("white", (), ()), Fact("blue", (), ()), "color")
     here, there = Fact("on the desk in the study", (), (), gist="study"), Fact("in the study", (), (), gist="study")
-    assert not differ(here, there, "place")
+    assert not are_different(here, there, "place")
 
 
 # -- twins -------------------------------------------------------------------------------------------------------------
@@ -428,7 +428,7 @@ def test_a_twin_asks_the_same_from_the_same_start_where_something_else_is_true(
                 continue
             found.append(template)
             assert (twin.text, twin.start_position, twin.start_yaw) == (each.text, each.start_position, each.start_yaw)
-            assert differ(twin.fact, each.fact, each.answer_type)
+            assert are_different(twin.fact, each.fact, each.answer_type)
             assert twin.scene.startswith(f"{each.scene}?")
             assert RULES.shortest <= twin.geodesic <= RULES.longest
     assert {"switch", "exists"} <= set(found)

@@ -190,7 +190,7 @@ def test_without_ray_or_a_cluster_it_is_said(tmp_path, monkeypatch):
     with pytest.raises(ArgumentError, match="give --engine ray"):
         RunConfig(address="auto")
     evaluate(TaskRecipe(TASK), AgentRecipe("heuristic"), 1, out=tmp_path / "here", progress=False).close()
-    with pytest.raises(ArgumentError, match="resume: address is for engine ray"):
+    with pytest.raises(ArgumentError, match="resume: address requires engine ray"):
         resume_run(tmp_path / "here", engine={"address": "auto"})
     with pytest.raises(ArgumentError, match="worker_gpus of at least 0"):
         RunConfig(engine="ray", worker_gpus=-1)

@@ -195,7 +195,9 @@ def test_a_server_that_dies_at_every_question_ends_the_run_after_three_tries(ray
     agent = AgentRecipe(WALKER, model, candidates=2, horizon=5, execute=3)
     out = tmp_path / "run"
     settings = {"engine": "ray", "servers": 1, "server_gpus": 0, "live": 2, "cache": "off", "progress": False}
-    with pytest.raises(InfrastructureError, match=r"lost 3 times while no episode ended: wiw serve .*exit code 9"):
+    with pytest.raises(
+        InfrastructureError, match=r"lost 3 times without any episode finishing: wiw serve .*exit code 9"
+    ):
         evaluate(TaskRecipe(TASK), agent, 6, out=out, **settings)
     rows = load_run(out).episodes
     assert [(row["status"], row["kind"]) for row in rows] == [("error", "server")] * 2
@@ -297,7 +299,7 @@ def test_commands_and_agents_of_servers():
 
 def test_servers_without_a_model_or_with_several_are_refused(tmp_path):
     agents = {"a": AgentRecipe("matcher", "warp"), "b": AgentRecipe("matcher", "warpnet"), "c": AgentRecipe("matcher")}
-    with pytest.raises(ArgumentError, match="got none; there are warp, warpnet"):
+    with pytest.raises(ArgumentError, match="got none; the arms have warp, warpnet"):
         find_served(agents, None)
     with pytest.raises(ArgumentError, match="got svd"):
         find_served(agents, "svd")
@@ -305,7 +307,7 @@ def test_servers_without_a_model_or_with_several_are_refused(tmp_path):
     other = {**agents, "d": AgentRecipe("matcher", "warp", model_options={"steps": 3})}
     with pytest.raises(ArgumentError, match="different options"):
         find_served(other, "warp")
-    with pytest.raises(ArgumentError, match="servers are actors of Ray"):
+    with pytest.raises(ArgumentError, match="servers are Ray actors"):
         evaluate(TaskRecipe(TASK), AgentRecipe("heuristic", "warp"), 1, out=tmp_path / "run", servers=1)
     with pytest.raises(ArgumentError, match="give --engine ray"):
         RunConfig(vlm_servers=1)

@@ -220,8 +220,8 @@ def test_foreign_and_damaged_files_are_refused(tmp_path: Path) -> None:
         ({"format": "wiw-recogniser-0"}, "another version"),
         ({"format": FORMAT}, "cannot be read"),
         ({"format": FORMAT, "header": "[1]"}, "expected an object"),
-        ({"format": FORMAT, "header": json.dumps(header)}, "do not make a recogniser"),
-        ({"format": FORMAT, "header": "{}"}, "do not make a recogniser"),
+        ({"format": FORMAT, "header": json.dumps(header)}, "do not form a recogniser"),
+        ({"format": FORMAT, "header": "{}"}, "do not form a recogniser"),
     ):
         save_file({"x": torch.zeros(1)}, file, metadata)
         with pytest.raises(FileError, match=message):

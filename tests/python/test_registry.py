@@ -116,11 +116,11 @@ def test_a_class_of_another_kind_is_refused(tmp_path: Path) -> None:
     (tmp_path / "thing.py").write_text("class Thing:\n    pass\n\n\ndef maker():\n    return Thing()\n")
     for registry, base in ((WORLD_MODELS, "WorldModel"), (POLICIES, "Policy")):
         for name in ("Thing", "maker"):
-            with pytest.raises(RegistryError, match=f"is no {registry.kind}: expected a class derived .*{base}"):
+            with pytest.raises(RegistryError, match=f"is not a {registry.kind}: expected a class derived .*{base}"):
                 registry.make(f"{tmp_path / 'thing.py'}:{name}")
-        with pytest.raises(RegistryError, match=f"is no {registry.kind}"):
+        with pytest.raises(RegistryError, match=f"is not a {registry.kind}"):
             registry.make(object())
-    with pytest.raises(RegistryError, match="is no world model"):
+    with pytest.raises(RegistryError, match="is not a world model"):
         wiw.Agent("heuristic", f"{tmp_path / 'thing.py'}:Thing")
     assert WORLD_MODELS.make("none") is None
 
@@ -133,7 +133,7 @@ def test_task_ids_and_paths_keep_their_case(tmp_path: Path, two_rooms: str) -> N
 
 
 def test_a_file_without_a_class_asks_for_one() -> None:
-    with pytest.raises(RegistryError, match=r"named 'mine\.py'\. A file .* as mine\.py:CLASS"):
+    with pytest.raises(RegistryError, match=r"named 'mine\.py'\. To use a file, .*: mine\.py:CLASS"):
         wiw.world_model("mine.py")
 
 

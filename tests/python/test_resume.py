@@ -71,7 +71,9 @@ def test_what_scores_or_measurements_depend_on_stays_when_a_run_is_resumed(tmp_p
     task, agent = TaskRecipe(fake, {}), AgentRecipe("heuristic", horizon=1)
     evaluate(task, agent, 1, out=tmp_path / "run", progress=False).close()
     for name, value in (("seed", 3), ("fidelity", True), ("candidates", 2), ("preset", "official")):
-        with pytest.raises(ArgumentError, match=f"'{name}' stays as the run was begun; .*deadline.*start a new run"):
+        with pytest.raises(
+            ArgumentError, match=f"'{name}' is fixed once a run has started; .*deadline.*start a new run"
+        ):
             resume_run(tmp_path / "run", **{name: value})
     with pytest.raises(SystemExit) as stop:
         main(["resume", str(tmp_path / "run"), "--seed", "3"])

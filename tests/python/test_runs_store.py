@@ -209,7 +209,7 @@ def test_another_configuration_is_refused_by_name(run, tmp_path):
     [
         ("PRAGMA user_version = 99", "schema version 99"),
         ("UPDATE run SET wiw_version = '0.0.1'", r"wiw 0\.0\.1"),
-        ("PRAGMA application_id = 1", "no run store"),
+        ("PRAGMA application_id = 1", "not a run store"),
     ],
 )
 def test_another_version_is_refused(run, tmp_path, statement, message):

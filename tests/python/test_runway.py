@@ -93,7 +93,7 @@ def test_it_ends_with_every_end_of_a_task(end, service, made):
 def test_a_task_that_takes_for_ever_is_given_up_and_found_again(service, made):
     service.plan = ("THROTTLED",)
     model = made(patience=0.05)
-    with pytest.raises(InfrastructureError, match="have not ended"):
+    with pytest.raises(InfrastructureError, match="have not finished"):
         rollout(model)
     service.plan = ("SUCCEEDED",)
     rollout(model)
@@ -103,7 +103,7 @@ def test_a_task_that_takes_for_ever_is_given_up_and_found_again(service, made):
 def test_the_budget_is_kept(service, made):
     model = made(budget=2 * fake_runway.COST)
     rollout(model, [(FORWARD,), (TURN_LEFT,)], [1, 2])
-    with pytest.raises(InfrastructureError, match="50 credits are spent of budget=50"):
+    with pytest.raises(InfrastructureError, match="50 credits of budget=50 are spent"):
         rollout(model, seeds=[3])
     assert len(service.orders) == 2
 
@@ -111,7 +111,7 @@ def test_the_budget_is_kept(service, made):
 def test_a_broken_download_costs_no_second_order(service, made):
     service.broken_videos = 1
     model = made()
-    with pytest.raises(InfrastructureError, match="no video"):
+    with pytest.raises(InfrastructureError, match="not a video"):
         rollout(model)
     rollout(model)
     assert len(service.orders) == 1

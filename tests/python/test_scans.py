@@ -52,7 +52,7 @@ def fine() -> None:
 @pytest.fixture
 def in_process(monkeypatch: pytest.MonkeyPatch) -> None:
     """Reads scenes without a child, which takes a second to start, and without the cache."""
-    monkeypatch.setattr(scenes, "load", partial(scenes.load, cache=False, isolate=False))
+    monkeypatch.setattr("wiw.scenes.opening.load", partial(scenes.load, cache=False, isolate=False))
 
 
 def load(path: Path, **options: Any) -> scenes.Scene:
@@ -182,9 +182,9 @@ class TestMatterport:
         [
             (lambda text: text.replace("ASCII 1.1", "ASCII 2.0"), "expected 'ASCII 1.1' in the first line"),
             (lambda text: text.replace("\nO 6", "\nX 6"), "has 6 objects, but its header says 7"),
-            (lambda text: text.replace("R 1 0", "R 3 0"), "line .*: no record 'O' of a house .*region 1 is not there"),
-            (lambda text: text.replace("C 4 104", "C x 104"), "line .*: no record 'C' of a house"),
-            (lambda text: text.replace("O 2 0 2 1.2", "O 2 0 2 nan"), "line .*: no record 'O' .*not finite"),
+            (lambda text: text.replace("R 1 0", "R 3 0"), "line .*: not a house record 'O' .*region 1 does not exist"),
+            (lambda text: text.replace("C 4 104", "C x 104"), "line .*: not a house record 'C'"),
+            (lambda text: text.replace("O 2 0 2 1.2", "O 2 0 2 nan"), "line .*: not a house record 'O' .*not finite"),
             (lambda text: "ASCII 1.1\n", "has no header record"),
         ],
     )
@@ -282,7 +282,7 @@ class TestHm3d:
             ('x,00FF00,"bed",0', "line 2: expected id,RRGGBB"),
             ('1,GG0000,"bed",0', "line 2: expected id,RRGGBB"),
             ('1,00FF00,"bed"', "line 2: expected id,RRGGBB"),
-            ('1,00FF00,"bed",0\n1,00FF01,"sofa",0', "line 3: .*is there already"),
+            ('1,00FF00,"bed",0\n1,00FF01,"sofa",0', "line 3: .*already used"),
         ],
     )
     def test_a_damaged_table_is_named(self, tmp_path: Path, row: str, message: str) -> None:
@@ -345,9 +345,12 @@ class TestReplica:
     @pytest.mark.parametrize(
         ("text", "message"),
         [
-            ("{", "no table of Replica's"),
-            ('{"classes": [{"id": 1, "name": "a"}], "objects": [{"id": 3, "class_id": 7}]}', "no table .*KeyError: 7"),
-            ('{"objects": []}', "no table .*KeyError: 'classes'"),
+            ("{", "not a Replica table"),
+            (
+                '{"classes": [{"id": 1, "name": "a"}], "objects": [{"id": 3, "class_id": 7}]}',
+                "not a Replica table .*KeyError: 7",
+            ),
+            ('{"objects": []}', "not a Replica table .*KeyError: 'classes'"),
         ],
     )
     def test_a_damaged_table_is_named(self, tmp_path: Path, text: str, message: str) -> None:
@@ -447,7 +450,7 @@ class TestSceneDataset:
         with pytest.raises(FileError) as caught:
             load(path)
         message = str(caught.value)
-        assert "home.scene_instance.json: 3 things" in message
+        assert "home.scene_instance.json: 3 objects" in message
         assert all(name in message for name in ("objects: chair", "part.glb", "front.glb"))
 
     def test_the_navigation_mesh_that_the_scene_names_is_used(self, tmp_path: Path) -> None:
@@ -467,7 +470,7 @@ class TestSceneDataset:
         ("change", "message"),
         [
             ({"stage_instance": {}}, "cannot be read as a scene instance .*KeyError: 'template_name'"),
-            ({"object_instances": [{"template_name": "chair", "rotation": [0, 0, 0, 0]}]}, "is no quaternion"),
+            ({"object_instances": [{"template_name": "chair", "rotation": [0, 0, 0, 0]}]}, "is not a quaternion"),
             ({"object_instances": [{"template_name": "chair", "translation": [1, 2]}]}, "three finite numbers"),
             ({"object_instances": 3}, "cannot be read as a scene instance"),
         ],
@@ -503,10 +506,10 @@ class TestSceneDataset:
         for text, message in (
             (whole[:80], "ParseError"),
             (whole.replace('xyz="0 0 1"', 'xyz="0 0 x"'), "ValueError"),
-            (whole.replace('parent link="body"', 'parent link="drawer"'), "circle"),
+            (whole.replace('parent link="body"', 'parent link="drawer"'), "cycle"),
         ):
             urdf.write_text(text)
-            with pytest.raises(FileError, match=rf"chest\.urdf: no URDF .*{message}"):
+            with pytest.raises(FileError, match=rf"chest\.urdf: not a readable URDF .*{message}"):
                 load(path)
 
 
@@ -518,8 +521,8 @@ def test_verify_says_what_is_wrong(tmp_path: Path, capsys: pytest.CaptureFixture
     damaged.with_name("info_semantic.json").write_text("{")
     assert main(["scenes", "verify", str(tmp_path / "all")]) == 1
     out = capsys.readouterr().out
-    assert "3 scans, 2 with something wrong" in out and "info_semantic.json: no table of Replica's" in out
-    assert "1 of 6 objects lie over 0.5 m from their boxes in the house file: 2" in out
+    assert "3 scans, 2 with something wrong" in out and "info_semantic.json: not a Replica table" in out
+    assert "1 of 6 objects are over 0.5 m from their boxes in the house file: 2" in out
     row = next(line.split() for line in out.splitlines() if line.startswith("whole"))
     assert row[2:7] == ["2", "0.0", "6", "6", "2"]
     assert main(["scenes", "verify", f"mp3d:{tmp_path / 'all' / 'whole'}"]) == 0
@@ -628,5 +631,5 @@ def test_nodes_of_a_labelled_mesh_without_scenes_count_once() -> None:
         assert {mesh: own[:3, 3].tolist() for mesh, own in placed.items()} == {0: [1, 2, 3], 1: [1, 2, 7], 2: [0, 0, 0]}
         assert len(Glb(Path("x.glb"), document, b"").node_transforms) == 3
     assert Glb(Path("x.glb"), {"nodes": nodes, "scenes": [{"name": "empty"}]}, b"").node_transforms == []
-    with pytest.raises(ValueError, match="circle"):
+    with pytest.raises(ValueError, match="cycle"):
         list(Glb(Path("x.glb"), {"nodes": [{"children": [1]}, {"children": [0]}]}, b"").node_transforms)

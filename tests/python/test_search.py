@@ -222,9 +222,9 @@ def test_what_cannot_be_searched_deeper_says_so() -> None:
         def rollout(self, observations, controls, seeds):
             raise AssertionError
 
-    with pytest.raises(ArgumentError, match="Front imagines the front view alone"):
+    with pytest.raises(ArgumentError, match="Front only imagines the front view"):
         wiw.Agent(Wanderer(), Front(), depth=2)
-    with pytest.raises(ArgumentError, match=r"Seeing needs it; write its `extend`"):
+    with pytest.raises(ArgumentError, match=r"Seeing needs them; implement its `extend`"):
         wiw.Agent(type("Seeing", (Wanderer,), {"needs": ("depth",)})(), "copy", depth=2)
     extending = type("Extending", (Wanderer,), {"needs": ("depth",), "extend": Wanderer.propose})
     assert wiw.Agent(extending(), "copy", depth=2).config.depth == 2

@@ -156,7 +156,7 @@ def test_without_a_source_it_is_said_what_to_choose(reader: str, two_rooms: str)
     with pytest.raises(ArgumentError, match="parts that need the simulator"):
         agent.decide_batch([query(one)])
     assert decide(agent, one)[0].calls["rows"] > 0
-    with pytest.raises(ArgumentError, match="knows one scene"):
+    with pytest.raises(ArgumentError, match="knows only one scene"):
         find_source(wiw.registry.SEMANTICS.make("simulator", categories={}))
 
 

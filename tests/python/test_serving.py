@@ -410,7 +410,7 @@ def test_a_server_that_comes_back_with_another_model_is_refused():
         client = Remote(server.address)
         ask(client)
     with serve_in_background(Plain(name="second"), port=port):
-        with pytest.raises(RemoteError, match="has come back with another") as caught:
+        with pytest.raises(RemoteError, match="has come back with different") as caught:
             ask(client, start=50)
         assert caught.value.kind == "model"
     with serve_in_background(Plain(name="first"), port=port):
@@ -543,7 +543,7 @@ def test_settings_out_of_range(wrong):
 def test_the_token_opens_and_no_other(monkeypatch):
     with serve_in_background(Plain(), token="secret") as server:
         for token in (None, "", "Secret", "secret2", "é"):
-            with pytest.raises(RemoteError, match="wants another token"):
+            with pytest.raises(RemoteError, match="expects a different token"):
                 Remote(server.address, token).close()
         assert server.refused >= 5
         client = Remote(server.address, "secret")
@@ -678,8 +678,8 @@ def test_rows_that_the_model_does_not_take_are_refused_one_by_one():
         "pixels": other_size,
         "does not take it": pack_row(make_conditioning(1, ("depth",)), 0, plans(1)[0], 7),
         "at least 1": row(0),
-        "no msgpack": b"\xc1",
-        "missing are": b"\x80",
+        "not valid msgpack": b"\xc1",
+        "missing fields": b"\x80",
     }
     model = Plain()
     with serve_in_background(model) as server, raw(server) as connection:
@@ -697,7 +697,7 @@ def test_an_answer_that_could_not_be_sent_is_not_computed():
     image = np.zeros((576, 1024, 3), np.uint8)
     for count, fits in ((100, True), (200, False)):
         asked = Row(image, None, None, None, plans(1, count)[0], 0)
-        with contextlib.nullcontext() if fits else pytest.raises(RemoteError, match="more than can be sent"):
+        with contextlib.nullcontext() if fits else pytest.raises(RemoteError, match="too many to send"):
             check_row(asked, wiw.accepts("image"))
 
 
@@ -839,7 +839,7 @@ def test_told_to_end_it_finishes_what_it_has_taken_and_takes_no_more():
             greeted(late)
             late.send(encode(Ask(row_id(row()), row(), 5.0, 0)))
             said = decode(late.recv())
-            assert isinstance(said, Wait) and said.reason == "the server is ending"
+            assert isinstance(said, Wait) and said.reason == "the server is shutting down"
             gate.set()
             np.testing.assert_array_equal(answer.result(20)[:, 5], make_conditioning(8).image)
             with pytest.raises(ConnectionClosed, match="1001"):
@@ -1019,7 +1019,7 @@ def test_a_client_that_reads_late_gets_all_answers(monkeypatch):
             heard = decode(client.recv(20))
             if isinstance(heard, Wait):
                 waited += 1
-                assert heard.reason == "earlier answers wait to be read"
+                assert heard.reason == "earlier answers have not been read yet"
                 client.send(encode(asks[heard.id]))
             else:
                 answers[heard.id] = heard.frames[0, 0, 0, 0]

@@ -127,10 +127,10 @@ def test_a_server_that_dies_at_its_work_loses_nothing(monkeypatch: pytest.Monkey
 
 
 def test_another_model_is_refused_at_the_start() -> None:
-    other = r"serves another model than ws://.*fingerprint other, expected counting 1"
+    other = r"serves a different model than ws://.*fingerprint other, expected counting 1"
     with pytest.raises(RemoteError, match=other), serve(Counting(), Counting("other")):
         pass
-    nameless = "several servers are used only for a model that can be told from another"
+    nameless = "several servers can only be used for a model that can be identified"
     with pytest.raises(RemoteError, match=nameless), serve(Counting(""), Counting("")):
         pass
 

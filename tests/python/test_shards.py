@@ -77,7 +77,7 @@ def test_shards_are_a_partition_of_about_equal_parts(episodes, count):
 def test_no_shard_is_refused(tmp_path, text):
     with pytest.raises(ArgumentError, match=f"shard I/N .* got '{text}'"):
         begin(tmp_path / "run", shard=text)
-    with pytest.raises(ArgumentError, match="there are 2 episodes"):
+    with pytest.raises(ArgumentError, match="with 2 episodes"):
         begin(tmp_path / "run", 2, shard="3/3")
     assert not (tmp_path / "run").exists()
 
@@ -120,16 +120,16 @@ def test_the_command_line_runs_merges_and_compares(tmp_path, capsys):
 
     run("--out", tmp_path / "whole", "--no-report")
     shown = [run("--out", tmp_path / "parts" / str(i), "--shard", f"{i}/2", "--resume") for i in (1, 2)]
-    assert all("shard   " in each.err and "merge all of them with `wiw merge`" in each.out for each in shown)
+    assert all("shard   " in each.err and "merge all shards with `wiw merge`" in each.out for each in shown)
     assert not list((tmp_path / "parts").rglob("report.html"))
     assert main(["merge", str(tmp_path / "parts"), "--out", str(tmp_path / "merged")]) == 0
-    assert "5 episodes of 2 stores" in capsys.readouterr().out
+    assert "5 episodes from 2 stores" in capsys.readouterr().out
     assert main(["report", str(tmp_path / "merged")]) == 0 and (tmp_path / "merged/report.html").exists()
     assert main(["verify", str(tmp_path / "merged")]) == 0
     assert main(["compare", str(tmp_path / "whole"), str(tmp_path / "merged")]) == 0
     assert read_rows(tmp_path / "merged") == read_rows(tmp_path / "whole")
     assert main(["merge", str(tmp_path / "parts"), "--out", str(tmp_path / "merged")]) == 2
-    assert "holds a run already" in capsys.readouterr().err
+    assert "already holds a run" in capsys.readouterr().err
 
 
 def test_missing_episodes_are_named_and_can_be_run(tmp_path, capsys):
@@ -158,7 +158,7 @@ def test_stores_of_unlike_runs_are_refused_and_the_difference_is_named(tmp_path,
         edit(tmp_path / "2", "UPDATE run SET config = replace(config, 'heuristic', 'matcher')")
     else:
         begin(tmp_path / "2", shard="2/2", **changed).close()
-    with pytest.raises(StoreError, match=f"not of the same run: {named}"):
+    with pytest.raises(StoreError, match=f"not from the same run: {named}"):
         wiw.merge([tmp_path / "1", tmp_path / "2"], tmp_path / "merged")
     assert not (tmp_path / "merged").exists()
 
@@ -168,7 +168,9 @@ def test_unlike_agents_are_refused_though_the_first_store_has_not_begun_that_arm
     edit(parts[0], "UPDATE run SET info = json_remove(info, '$.built.none')")
     assert wiw.merge(parts, tmp_path / "merged").complete
     edit(parts[2], "UPDATE run SET info = json_set(info, '$.built.none.weights', 'others')")
-    with pytest.raises(StoreError, match=r"2 and .*3 had unlike agents: agent none.weights: \"absent\" and \"others\""):
+    with pytest.raises(
+        StoreError, match=r"2 and .*3 had different agents: agent none.weights: \"absent\" and \"others\""
+    ):
         wiw.merge(parts, tmp_path / "again")
 
 
@@ -205,7 +207,9 @@ def test_unlike_records_of_built_in_parts_are_refused(tmp_path, two_rooms):
     shutil.copytree(tmp_path / "1", tmp_path / "2")
     assert wiw.merge([tmp_path / "1", tmp_path / "2"], tmp_path / "merged").repeated == 1
     edit(tmp_path / "2", "UPDATE decision SET after_x = after_x + 1e-9")
-    with pytest.raises(StoreError, match=r"none episode 0 has unlike records .* equal ones are promised .*: after_x"):
+    with pytest.raises(
+        StoreError, match=r"none episode 0 has different records .* its parts guarantee equal ones .*: after_x"
+    ):
         wiw.merge([tmp_path / "1", tmp_path / "2"], tmp_path / "again")
 
 

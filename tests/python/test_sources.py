@@ -79,7 +79,7 @@ def test_what_has_changed_is_named(tmp_path: Path) -> None:
     require_sources(tmp_path, {"a": "1"}, {"a": "1"})
     require_sources(tmp_path, None, {"a": "1"})
     for now in ({"a": "2"}, {}, {"a": "1", "b": "1"}):
-        with pytest.raises(StoreError, match=r"changed since the run was begun: [ab]\. .*begin a new run"):
+        with pytest.raises(StoreError, match=r"changed since the run was started: [ab]\. .*start a new run"):
             require_sources(tmp_path, {"a": "1"}, now)
 
 
@@ -97,7 +97,7 @@ def test_an_edited_model_is_no_part_of_its_old_run(folder: Path, two_rooms: str,
         lambda: evaluate(task, agent, 2, out=run, resume=True, progress=False),
         lambda: verify(run),
     ):
-        with pytest.raises(StoreError, match=rf"source files have changed.*{name}.*begin a new run in another folder"):
+        with pytest.raises(StoreError, match=rf"source files have changed.*{name}.*start a new run in another folder"):
             go_on()
     (folder / name).write_text(text)
     assert resume_run(run, progress=False).complete and verify(run).same
@@ -119,7 +119,7 @@ def test_a_model_that_could_not_be_made_is_mended_and_the_run_resumes(folder: Pa
     agent = AgentRecipe("heuristic")
     with pytest.raises(ConstructionError, match="no weights") as caught:
         evaluate(task, agent, 2, out=run, arms=["none", f"{folder}/broken.py:Broken"], progress=False)
-    assert caught.value.__notes__ == [f"What was recorded is kept. Once the cause is mended:  wiw resume {run}"]
+    assert caught.value.__notes__ == [f"Everything recorded is kept. Once the cause is fixed:  wiw resume {run}"]
     mended = "from own import Own\n\n\nclass Broken(Own):\n    pass\n"
     (folder / "broken.py").write_text(mended)
     log = resume_run(run, progress=False)

@@ -72,7 +72,7 @@ def test_arms_of_two_names(runs):
     assert found.utility("mine · new").value == load_run(runs[1]).numbers().utility("mine").value
     with pytest.raises(ArgumentError, match=r"no arm 'mine' in .*old; it has copy, oracle, warp"):
         wiw.compare(*runs, arm="mine")
-    with pytest.raises(ArgumentError, match="arm= must name one of the first"):
+    with pytest.raises(ArgumentError, match="also name one of the first with arm="):
         wiw.compare(*runs, other="mine")
 
 
@@ -116,7 +116,7 @@ class Moved(LineTask):
             LineTask(budget=12),
             16,
             None,
-            r"unlike budgets: task.budget is 15 in the first and 12 in the second.*--unlike-budgets",
+            r"different budgets: task.budget is 15 in the first and 12 in the second.*--unlike-budgets",
         ),
         (LineTask(seed=1), 16, None, "task.seed is 0 in the first and 1"),
         (LineTask(), 16, 7, r"seed is 0 in the first and 7 in the second.*--seed 0"),
@@ -151,11 +151,11 @@ def test_unlike_budgets_are_refused_unless_they_are_asked_for(tmp_path, horizon,
     runs = [tmp_path / name for name in ("short", "long", "other")]
     for run, numbers in zip(runs, [(5, 3), (horizon, execute), (10, 3)], strict=True):
         run_arms(LineTask(), {"warp": Planner(*numbers)}, 8, out=run, progress=False)
-    message = f"unlike budgets: warp carries out 3 and {count} actions per decision"
+    message = f"different budgets: warp executes 3 and {count} actions per decision"
     with pytest.raises(StoreError, match=message):
         wiw.compare(runs[0], runs[1])
     assert main(["compare", *map(str, runs[:2]), "--unlike-budgets"]) == 0
-    assert f"carries out 3 and {count} actions" in " ".join(capsys.readouterr().out.split())
+    assert f"executes 3 and {count} actions" in " ".join(capsys.readouterr().out.split())
     assert not any("BUDGETS" in line for line in wiw.compare(runs[0], runs[2]).remarks())
 
 

@@ -176,10 +176,12 @@ def test_an_agents_own_arm_is_named_by_the_class_of_its_model_behind_all_wrapper
 
 def test_an_existing_run_is_continued_only_on_request(reference, tmp_path):
     first = run(tmp_path / "run")
-    with pytest.raises(StoreError, match="holds a run already"):
+    with pytest.raises(StoreError, match="already holds a run"):
         run(tmp_path / "run")
     assert facts(run(tmp_path / "run", resume=True)) == facts(first) == facts(reference)
-    with pytest.raises(StoreError, match=r"another configuration \(arms\.\w+\.drive: the run has [0-9.]+, now 0\.9\)"):
+    with pytest.raises(
+        StoreError, match=r"a different configuration \(arms\.\w+\.drive: the run has [0-9.]+, now 0\.9\)"
+    ):
         run(tmp_path / "run", resume=True, agent=LineAgent(0.9))
     with pytest.raises(StoreError, match="resume=True"):
         resume_run(tmp_path / "run")
@@ -193,7 +195,7 @@ def test_a_run_gains_arms_on_request_unless_a_rule_may_stop_it(tmp_path):
         return run_arms(LineTask(), some, 8, out=tmp_path / "run", progress=False, salt="pepper", **options)
 
     begun = run_some("none").episodes
-    with pytest.raises(StoreError, match="another configuration"):
+    with pytest.raises(StoreError, match="a different configuration"):
         run_some("none", "warp", resume=True)
     grown = run_some("none", "warp", resume=True, more_arms=True)
     assert grown.complete and grown.episodes[:8] == begun

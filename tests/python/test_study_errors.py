@@ -13,7 +13,7 @@ import pytest
 from wiw.analysis.errors import METRES, summarise_errors
 from wiw.cli import main
 from wiw.errors import ArgumentError, StoreError
-from wiw.experiments.errors import ERRORS
+from wiw.experiments.errors.kinds import ERRORS
 from wiw.report.error_page import write_errors
 from wiw.report.error_tables import explain, print_errors
 from wiw.studies.errors import ErrorSettings, make_recipes, read_errors, study_errors
@@ -84,7 +84,7 @@ def test_the_words_say_what_the_numbers_do(table) -> None:
     text = " ".join(explain(table))
     assert "Errors of control cost 12.5" in text and "control costs more" in text
     assert "Errors of looks cost 0.0" in text and "error-lag@4" in text
-    assert "Left out, for they make no sense in imagenav: open." in text
+    assert "Left out, as they make no sense in imagenav: open." in text
 
 
 def test_the_page_has_figure_tables_and_units(table, tmp_path: Path) -> None:
@@ -150,7 +150,7 @@ def test_a_study_goes_on_where_it_stopped_and_gains_kinds(two_rooms: str, tmp_pa
     (table,) = found.tables
     assert [line.arm for line in table.lines] == ["error-blur@64", "error-ignored@1"] and table.episodes == 2
     stores = sorted((tmp_path / "study").rglob("run.sqlite"))
-    with pytest.raises(StoreError, match="another configuration"):
+    with pytest.raises(StoreError, match="a different configuration"):
         study_errors(tmp_path / "study", replace(settings, kinds=("blur",)))
     again = study_errors(tmp_path / "study", settings)
     assert again.to_json() == found.to_json() == read_errors(tmp_path / "study", settings).to_json()

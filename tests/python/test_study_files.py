@@ -52,7 +52,7 @@ def test_a_study_runs_resumes_and_draws_its_page(own: Path, tmp_path: Path, caps
     command = ["study", str(own), "--out", str(out), "--set", "episodes=2"]
     assert main(command) == 0
     said = capsys.readouterr().out
-    assert "Compared, paired by episode" in said and str(out / "study.html") in said
+    assert "Comparisons, paired by episode" in said and str(out / "study.html") in said
     written = {path.name for path in out.iterdir()}
     assert written >= {"study.html", "study.json", "study.yaml", "here", "here-success-by-arm.svg"}
     page = (out / "study.html").read_text()
@@ -96,7 +96,7 @@ def test_a_study_that_was_begun_may_gain_arms_and_nothing_else(own: Path, tmp_pa
     assert log.arms == ["none", "front", "around"]
     assert [each["arms"] for each in log.store.info["arms_added"]] == [["front"]]
     for names, changes in ((("none", "front"), {}), (("none", "front", "around"), {"candidates": 3})):
-        with pytest.raises(StoreError, match=r"run of another configuration \(arms"):
+        with pytest.raises(StoreError, match=r"run with a different configuration \(arms"):
             run("grown", *names, **changes)
 
 
@@ -123,7 +123,11 @@ def test_variables_are_filled_in_and_arms_are_merged(own: Path) -> None:
             '"{modle}", reviser',
             "runs: here: agent: model: unknown name 'modle'.*Did you mean model",
         ),
-        ("small: {episodes", "small: {episode", "small: unknown name 'episode'; there are scenes, model, episodes"),
+        (
+            "small: {episodes",
+            "small: {episode",
+            "small: unknown name 'episode'; expected one of scenes, model, episodes",
+        ),
         ("policy: heuristic, ", "", "arms: none: expected a policy, here or in `agent`, got none"),
         ("candidates: 2", "candidate: 2", "arms: none: unknown name 'candidate'.*Did you mean candidates"),
         ("[around, front], ", "[round, front], ", "compare: unknown name 'round'.*Did you mean around"),
@@ -136,7 +140,7 @@ def test_variables_are_filled_in_and_arms_are_merged(own: Path) -> None:
         ("seed: 3", "cache: off", "settings: cache: expected text or a path.*, got False"),
         ("candidates: 2", "candidates: two", "arms: none: candidates: expected a whole number or null, got 'two'"),
         ("candidates: 2", "ground_truth: scoring", "ground_truth: expected a list.*, got 'scoring'"),
-        ("{model: none, reviser: null}", "{model: copy}", "reports take the arm 'none' for the reference"),
+        ("{model: none, reviser: null}", "{model: copy}", "the name 'none' is reserved for the reference"),
         ("      front:", "      fr/ont:", "arms"),
         ("runs:\n  here:", "runs: {}\nsmal:\n  here:", "unknown name 'smal'"),
     ],
@@ -157,7 +161,7 @@ def test_studies_are_listed_taught_and_looked_up(capsys: Any, tmp_path: Path) ->
     with pytest.raises(SystemExit):
         main(["study"])
     taught = capsys.readouterr().out
-    example = taught[taught.index("  title:") : taught.index("Arms take")]
+    example = taught[taught.index("  title:") : taught.index("An arm accepts")]
     (tmp_path / "example.yaml").write_text(example)
     assert [*load_study(tmp_path / "example.yaml").runs[0].agents] == [
         "none",

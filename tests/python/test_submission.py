@@ -145,7 +145,7 @@ def test_cancelled_jobs_end_and_keep_what_is_recorded(tmp_path, capsys):
     out = tmp_path / "run"
     assert submit(out, "--live", 1, scenes="slow", shards=1, episodes=40) == 0
     wait_for(lambda: count_decisions(tmp_path) >= 2)
-    with pytest.raises(ArgumentError, match="is RUNNING, and 1 in all; wait for them, or `wiw cancel"):
+    with pytest.raises(ArgumentError, match=r"is RUNNING \(1 active in all\); wait for them, or `wiw cancel"):
         submit_again = ["--live", 1, "--debug"]
         submit(out, *submit_again, scenes="slow", shards=1, episodes=40)
     assert main(["cancel", str(out)]) == 0 and "told 1 jobs" in capsys.readouterr().out
@@ -284,7 +284,7 @@ def test_shards_of_which_slurm_says_nothing_are_not_submitted_twice(tmp_path, sl
     submitit.SlurmJob.watcher.clear()
     out = tmp_path / "run"
     assert submit(out, cluster="slurm", scenes="slow") == 0
-    with pytest.raises(ArgumentError, match=r"job 70_0 of .* is UNKNOWN, and 2 in all; .* remove .*jobs.json"):
+    with pytest.raises(ArgumentError, match=r"job 70_0 of .* is UNKNOWN \(2 active in all\); .* remove .*jobs.json"):
         submit(out, "--debug", cluster="slurm", scenes="slow")
     wait_for(lambda: len(list(out.glob("*/run.sqlite"))) == 2 and wiw.status(out).ended == 6)
     submitit.SlurmJob.watcher.clear()

@@ -82,7 +82,7 @@ def test_bounds_of_observations_are_shared(two_rooms: str) -> None:
 @pytest.mark.parametrize("make", [wiw.make, lambda name, **options: wiw.make_vec(name, 2, **options)])
 def test_an_unknown_reset_option_is_refused(make: Any, two_rooms: str) -> None:
     for env in (make("ImageNav-v0", scenes=two_rooms), make("Manipulation-v0", size=32)):
-        with pytest.raises(ArgumentError, match="reset: unknown option 'episodes'; the only one is 'episode'"):
+        with pytest.raises(ArgumentError, match="reset: unknown option 'episodes'; the only option is 'episode'"):
             env.reset(options={"episodes": 3})
         env.close()
 
@@ -90,7 +90,7 @@ def test_an_unknown_reset_option_is_refused(make: Any, two_rooms: str) -> None:
 def test_what_an_environment_lacks_is_named() -> None:
     env = TASKS.make(f"{EXAMPLES / 'corridor.py'}:Corridor").environment()
     for use, message in (
-        (env.fork, "CorridorEnv has no simulator.*write `CorridorEnv.fork`"),
+        (env.fork, "CorridorEnv has no simulator.*implement `CorridorEnv.fork`"),
         (env.guide, "wiw blame.*CorridorEnv.guide"),
         (env.semantic, "--semantics simulator"),
     ):
@@ -123,7 +123,7 @@ def test_nothing_probes_tasks_or_environments() -> None:
 def test_a_class_that_is_no_task_is_refused(tmp_path: Path) -> None:
     (tmp_path / "mine.py").write_text("class Mine:\n    name = 'mine'\n\n\ndef make():\n    return Mine()\n")
     for name in ("Mine", "make"):
-        with pytest.raises(RegistryError, match=r"is no task: expected a class derived from wiw\.Task"):
+        with pytest.raises(RegistryError, match=r"is not a task: expected a class derived from wiw\.Task"):
             TASKS.make(f"{tmp_path / 'mine.py'}:{name}")
     with pytest.raises(ArgumentError, match="expected a task"):
         task_recipe(object())
@@ -168,7 +168,7 @@ def test_the_example_of_a_variant_runs_under_the_presets_of_what_it_derives_from
     assert not env.state.success and env.run([STOP]).terminated and env.result()["success"] == 1
     with pytest.raises(
         ArgumentError,
-        match=r"no preset 'offical'; there are default, paper, .*Did you mean official\?",
+        match=r"no preset 'offical'; choose from default, paper, .*Did you mean official\?",
     ):
         TASKS.make(name, preset="offical")
 
@@ -197,7 +197,9 @@ def test_a_task_with_rules_of_its_own_needs_no_preset(two_rooms: str, tmp_path: 
     assert Mine(scenes=two_rooms, preset=own).rules == Rules(2.0, 3)
     with pytest.raises(ArgumentError, match="leaves open radius, or give Rules defaults"):
         Mine(scenes=two_rooms)
-    with pytest.raises(ArgumentError, match=r"mine: no preset 'official'; it ships none; give the path of a \.yaml"):
+    with pytest.raises(
+        ArgumentError, match=r"mine: no preset 'official'; it has none of its own; give the path of a \.yaml"
+    ):
         Mine(scenes=two_rooms, preset="official")
 
 
@@ -226,7 +228,9 @@ def test_a_file_of_episodes_is_run_whole_unless_asked_otherwise(two_rooms: str, 
     assert main(["episodes", "imagenav", "--scenes", two_rooms, "--episodes", "2", "--out", str(path)]) == 0
     task = ImageNav(episode_file=path)
     assert task.default_episodes == 2 and ImageNav(scenes=two_rooms).default_episodes == 20
-    with pytest.raises(ArgumentError, match=r"asked for 3 episodes, but .*two\.json has 2; ask for fewer, or leave"):
+    with pytest.raises(
+        ArgumentError, match=r"3 episodes were requested, but .*two\.json has only 2; request fewer, or omit"
+    ):
         task.episodes(3)
     arguments = ["--policy", "heuristic", "--no-report", "--keep-images", "0", "--task-option", "decisions=1"]
     assert main(["run", "imagenav", "--episode-file", str(path), "--out", str(tmp_path / "run"), *arguments]) == 0

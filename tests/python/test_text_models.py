@@ -305,8 +305,8 @@ def write_damaged(lora, kind: str) -> dict[str, torch.Tensor]:
     [
         ("none of them", "the LoRA matches no layer: other.transformer_blocks"),
         ("some", r"1 of 3 layers of the LoRA are not in the network: blocks\.9\.to_q"),
-        ("side", r"1 of 2 layers of the LoRA lack a side or are of other sizes .*blocks\.0\.attn1\.to_q"),
-        ("size", r"1 of 2 layers of the LoRA lack a side or are of other sizes .*blocks\.0\.attn1\.to_q"),
+        ("side", r"1 of 2 layers of the LoRA lack one side or differ in size .*blocks\.0\.attn1\.to_q"),
+        ("size", r"1 of 2 layers of the LoRA lack one side or differ in size .*blocks\.0\.attn1\.to_q"),
         ("kind", "expected names that end with lora_A.weight or lora_B.weight, got .*dora_scale"),
     ],
 )

@@ -264,7 +264,7 @@ def test_parts_of_other_spaces_are_refused_in_its_words() -> None:
         wiw.Agent(Fiddler(), "warp")
     with pytest.raises(ArgumentError, match=r"plans in turns of a dial, but the reviser .* discrete primitives"):
         wiw.Agent(Fiddler(), StillDial(), reviser="matcher")
-    with pytest.raises(ArgumentError, match="turns of a dial lead to none"):
+    with pytest.raises(ArgumentError, match="turns of a dial do not lead to other places"):
         wiw.Agent(Fiddler(), StillDial(), depth=2)
 
     class Wild(Fiddler):

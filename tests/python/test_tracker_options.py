@@ -68,11 +68,11 @@ def test_options_alone_are_those_of_the_policys_own_tracker(weights: Path, conte
 
 
 def test_trackers_that_nobody_looks_through_are_refused(context: RunContext) -> None:
-    with pytest.raises(ArgumentError, match=r"tracker: policy matcher takes none; expected .* vlm or recogniser"):
+    with pytest.raises(ArgumentError, match=r"tracker: policy matcher does not use one; expected .* vlm or recogniser"):
         AgentRecipe("heuristic", "copy", "matcher", tracker="flow").build(context)
     with pytest.raises(RegistryError, match=r"tracker 'flow': .*weights"):
         AgentRecipe("vlm", "copy", tracker="flow", tracker_options={"weights": "x"}).describe()
-    with pytest.raises(ArgumentError, match="task 'imagenav' points nothing out"):
+    with pytest.raises(ArgumentError, match="task 'imagenav' has no target to track"):
         AgentRecipe("matcher", tracker="flow").require(ImageNav(scenes="apartments:val"), 2)
     nav = RunContext(ImageNav(scenes="apartments:val"))
     assert "tracker" not in AgentRecipe("vlm", **VLM).build(nav).describe()["policy"]

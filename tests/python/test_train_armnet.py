@@ -213,7 +213,7 @@ def test_the_command_goes_on_only_with_the_same_demonstrations_and_until_all_is_
     assert load(out)[1]["collection"]["seed"] == 0
     (demos / "manifest.json").write_text('{"tasks": ["slide_block"], "episodes": 1, "seed": 1}')
     assert main(command) == 2
-    assert "a training with other data or options" in capsys.readouterr().err
+    assert "a training with different data or options" in capsys.readouterr().err
 
 
 class _Nothing:

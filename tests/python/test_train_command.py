@@ -94,7 +94,7 @@ def test_the_help_says_how_many_epochs_the_recipe_has(what: str, capsys: pytest.
     with pytest.raises(SystemExit):
         main(["train", what, "--help"])
     text = " ".join(capsys.readouterr().out.replace("│", " ").split())
-    (said,) = re.findall(r"How often each sample is used, on average\. Default: (\d+)\.", text)
+    (said,) = re.findall(r"how often each sample is used, on average\. Default: (\d+)\.", text)
     assert int(said) == importlib.import_module(f"wiw.training.{what}").Recipe().epochs
 
 

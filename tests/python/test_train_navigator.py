@@ -16,7 +16,7 @@ from wiw.errors import ArgumentError
 
 torch = pytest.importorskip("torch", reason="needs wiw[torch]")
 
-from wiw.policies.navigator import Navigator  # noqa: E402
+from wiw.policies.navigator.policy import Navigator  # noqa: E402
 from wiw.training.checkpoint import Checkpoint  # noqa: E402
 from wiw.training.goal_places import GoalPlaces, PlaceRules, record_goal_places, require_places  # noqa: E402
 from wiw.training.navigator import Recipe, evaluate, measure_prior, sample_pairs, spread_bearings, train  # noqa: E402
@@ -43,7 +43,7 @@ def test_places_know_the_ways_between_them(places: GoalPlaces, two_rooms: str) -
     assert np.median(np.abs(back[seen] - np.pi)) < 0.05
     again = record_goal_places(world(two_rooms, "cpu"), 0, RULES)
     np.testing.assert_array_equal(again.bands, places.bands)
-    with pytest.raises(ArgumentError, match="from a place to another"):
+    with pytest.raises(ArgumentError, match="from one place to another"):
         require_places([])
 
 
@@ -125,7 +125,7 @@ def test_scenes_without_ways_are_left_out_and_what_cannot_be_measured_is_none(pl
     prior = measure_prior([places], SMALL, draws=2)
     apart = replace(places, distances=np.where(np.eye(len(places)) > 0, 0, np.inf).astype(np.float16))
     assert require_places([apart, places]) == [places]
-    with pytest.raises(ArgumentError, match="from a place to another"):
+    with pytest.raises(ArgumentError, match="from one place to another"):
         require_places([apart])
     assert evaluate(network, prior, [apart, places], 0, most=10)["pairs"] == 10
     with pytest.raises(ArgumentError, match="within 9 m"):

@@ -196,7 +196,7 @@ def test_apartments_are_recorded_in_other_states_too() -> None:
 def test_recipes_are_checked() -> None:
     with pytest.raises(ArgumentError, match="epochs, batch and widths must be positive"):
         Recipe(epochs=0)
-    with pytest.raises(ArgumentError, match="in which one can stand"):
+    with pytest.raises(ArgumentError, match="with walkable floor"):
         merge_views([])
 
 
@@ -211,7 +211,7 @@ def test_colors_are_calibrated() -> None:
     views = made_up(4, 2)
     nothing = replace(views, pixels=views.pixels[:0], color=views.color[:0], colored_category=views.color[:0])
     assert color_naming.evaluate(namer, nothing)["accuracy"] is None
-    with pytest.raises(ArgumentError, match="things of known colours"):
+    with pytest.raises(ArgumentError, match="objects of known colours"):
         color_naming.calibrate(nothing, 0)
 
 

@@ -225,7 +225,7 @@ def test_the_command_trains_measures_and_is_run(
     command = ["train", "pocket", "--data", str(dataset), "--out", str(out), "--cache", str(tmp_path / "cache")]
     command += ["--part", "all", *options]
     assert main([*command, "--val", two_rooms]) == 2 and not out.exists()
-    assert "trained on, got " + two_rooms in capsys.readouterr().err
+    assert "held-out scenes, got " + two_rooms in capsys.readouterr().err
     val = shutil.copy(two_rooms, tmp_path / "another.obj")
     monkeypatch.setattr("wiw.training.pocket.held_out.evaluate", fail)
     assert main([*command, "--val", str(val)]) == 2 and "held_out" not in Pocket(out).card
@@ -244,7 +244,7 @@ def test_the_command_trains_measures_and_is_run(
 @pytest.mark.parametrize(
     ("options", "said"),
     [
-        ([], "pocket trains on a dataset; give a folder of `wiw collect navigation` by --data"),
+        ([], "pocket trains on a dataset; give a folder of `wiw collect navigation` with --data"),
         (["--data", "nowhere"], "nowhere"),
         (["--data", "d", "--option", "lr=1"], "recipe: unknown name 'lr'"),
     ],

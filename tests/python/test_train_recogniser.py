@@ -159,7 +159,7 @@ def test_training_goes_on_from_a_network() -> None:
     plain = train(looks, NAMES, replace(recipe, sizes=False))[0]
     told = train(looks, NAMES, recipe, start=plain)[0]
     assert torch.equal(told.mix[0].weight[:, :-3], plain.mix[0].weight) and not told.mix[0].weight[:, -3:].any()
-    with pytest.raises(ArgumentError, match="with sizes"):
+    with pytest.raises(ArgumentError, match="sizes=True"):
         train(looks, NAMES, replace(recipe, sizes=False), start=told)
     with pytest.raises(ArgumentError, match="expected a start of 3 categories and width 8, got 3 and 4"):
         train(looks, NAMES, Recipe(width=8), start=first)
@@ -301,7 +301,7 @@ def test_the_command_refuses_what_cannot_end_well(
     tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     assert main(["train", "recogniser", "--out", str(tmp_path / "no" / "x")]) == 2
-    assert "folder that exists" in capsys.readouterr().err
+    assert "existing folder" in capsys.readouterr().err
     overlapping = ["--scenes", "apartments:train:3", "--val", "apartments:train:1", "--out", str(tmp_path / "x")]
     assert main(["train", "recogniser", *overlapping]) == 2
     assert "apartments:train/0 in both" in capsys.readouterr().err

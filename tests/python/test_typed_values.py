@@ -80,6 +80,6 @@ def test_what_does_not_fit_is_refused_in_words(name: str, given: Any, expected: 
 
 def test_an_unknown_name_is_refused_with_what_is_like_it() -> None:
     with pytest.raises(
-        ArgumentError, match=r"^here: unknown rule 'size_'; there are count, .*\. Did you mean sizes? or"
+        ArgumentError, match=r"^here: unknown rule 'size_'; expected one of count, .*\. Did you mean sizes? or"
     ):
         read_values(Declared, {"count": 1, "size_": 1}, "here", "rule")

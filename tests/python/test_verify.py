@@ -45,7 +45,7 @@ def test_a_run_comes_out_again_as_it_was_recorded(run, capsys):
     chosen = [tuple(c.episode for c in wiw.verify(run, 2, seed).checks) for seed in (0, 0, 1, 2, 3)]
     assert chosen[0] == chosen[1] and len(set(chosen)) > 1
     assert main(["verify", str(run), "--episodes", "2"]) == 0
-    assert "all as recorded" in capsys.readouterr().out and store_path(run).read_bytes() == before
+    assert "everything is as recorded" in capsys.readouterr().out and store_path(run).read_bytes() == before
 
 
 def test_with_a_world_model_pictures_and_several_arms(two_rooms, tmp_path):
@@ -103,5 +103,5 @@ def test_what_cannot_be_verified_says_why(run, tmp_path):
         wiw.verify(run, episodes=0)
     with sqlite3.connect(store_path(run)) as store:
         store.execute("DELETE FROM outcome")
-    with pytest.raises(StoreError, match="no ended episode"):
+    with pytest.raises(StoreError, match="no finished episode"):
         wiw.verify(run)

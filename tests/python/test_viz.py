@@ -50,7 +50,7 @@ def test_show_draws_plans_of_poses():
 
 
 def test_show_needs_an_observation():
-    with pytest.raises(ArgumentError, match="carries no observation"):
+    with pytest.raises(ArgumentError, match="contains no observation"):
         wiw.show(decision(observation=False))
 
 

@@ -318,7 +318,7 @@ def test_a_recorded_answer_is_given_again_and_nothing_else(tmp_path: Path) -> No
     replay = connect(f"replay:{tmp_path}")
     assert replay.model == "mock"
     np.testing.assert_array_equal(ask(replay, IMAGE, choices=("a", "b")).probabilities, reply.probabilities)
-    with pytest.raises(VlmError, match="holds no answer") as error:
+    with pytest.raises(VlmError, match="has no answer") as error:
         ask(replay, IMAGE, choices=("a", "c"))
     assert error.value.kind == "missing"
     with pytest.raises(FileError, match="one model, got none"):

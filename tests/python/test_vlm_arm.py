@@ -19,10 +19,11 @@ pytest.importorskip("json_repair")
 import wiw
 from misbehaviour import MisbehavingVlmServer, Misbehaviour
 from wiw.errors import ArgumentError, PromptError
-from wiw.policies.vlm import VLM
-from wiw.policies.vlm.arm import ArmVLM, plans, prompt_images
+from wiw.policies.vlm.arm import plans, prompt_images
 from wiw.policies.vlm.arm.plans import GRID
-from wiw.policies.vlm.prompts import ARM_SLOTS, Prompts
+from wiw.policies.vlm.arm.policy import ArmVLM
+from wiw.policies.vlm.policy import VLM
+from wiw.policies.vlm.prompts.templates import ARM_SLOTS, Prompts
 from wiw.runs.recipes import AgentRecipe
 from wiw.studies.evaluate import evaluate
 from wiw.tabletop.workbench import CAMERAS, TABLE
@@ -308,7 +309,7 @@ def test_one_name_for_primitives_and_poses() -> None:
     assert posing.policy.describe()["policy"] == "ArmVLM" and "tracker" not in posing.policy.describe()
     for policy, name in (("heuristic", "Heuristic"), (agent.policy, "VLM")):
         with pytest.raises(
-            ArgumentError, match=f"plans in poses of a gripper, but policy {name} makes them of discrete primitives"
+            ArgumentError, match=f"plans in poses of a gripper, but policy {name} makes plans of discrete primitives"
         ):
             agent_for(Manipulation(), wiw.Agent(policy))
     with pytest.raises(ArgumentError, match="among ar, imagenav, got 'manipulation'"):

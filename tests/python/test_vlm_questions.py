@@ -36,8 +36,9 @@ from wiw.mapping.views import SIZE
 from wiw.perception.detection import Detections, Detector
 from wiw.perception.detector_labeller import DetectorLabeller
 from wiw.policies.vlm.make import make_vlm
-from wiw.policies.vlm.questions import QuestionVLM, commands, steering
+from wiw.policies.vlm.questions import commands, steering
 from wiw.policies.vlm.questions.home_map import HomeMap, find_named
+from wiw.policies.vlm.questions.policy import QuestionVLM
 from wiw.runs.recipes import AgentRecipe
 from wiw.serving.vlm_server import VlmServer
 from wiw.tasks import presets
@@ -488,7 +489,7 @@ def test_options_out_of_range() -> None:
             make_policy(None, **wrong)
     with pytest.raises(ArgumentError, match="instance ids"):
         make_vlm(task="aeqa", vlm="mock", perception=wiw.registry.LABELLERS.make("oracle", instances=[]))
-    with pytest.raises(ArgumentError, match="make it with task='aeqa'"):
+    with pytest.raises(ArgumentError, match="create it with task='aeqa'"):
         make_vlm(vlm="mock").begin(wiw.types.Goal("aeqa", text="Why?", question=True), Key(0, 0))
     with pytest.raises(ArgumentError, match="imagined places, which have no depth"):
         wiw.Agent(make_policy(None), "copy", depth=2)

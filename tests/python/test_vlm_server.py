@@ -316,7 +316,7 @@ def test_a_server_that_refuses_to_list_tokens_is_asked_for_votes() -> None:
         return "B"
 
     with VlmServer(MockClient(script)) as server:
-        with pytest.raises(VlmError, match="0 has choices voted on"):
+        with pytest.raises(VlmError, match="to 0 to vote on choices"):
             connect(server.url).ask(REQUESTS[:1])
         client = connect(server.url, top_logprobs=0)
         few, many = client.ask([REQUESTS[0], REQUESTS[3]])

@@ -45,7 +45,7 @@ def test_the_mesh_of_another_scene_is_refused(house: Path) -> None:
     far = NavMesh.from_triangles(floor, np.array([[0, 2, 1], [0, 3, 2]]))
     far.save(house.with_suffix(".navmesh"))
     with pytest.raises(
-        FileError, match=r"house\.navmesh: its mesh reaches from .* expected the mesh of this very scene"
+        FileError, match=r"house\.navmesh: its mesh reaches from .* expected the navigation mesh of this scene"
     ):
         world(str(house))
 

@@ -41,7 +41,7 @@ def calibrate_confidence(run: str | Path) -> dict[str, dict[str, list[float]]]:
         by answer type, {"support": ascending, "right": shares}; see `wiw.policies.explorer.confidence`.
 
     Raises:
-        StoreError: no readable run.
+        StoreError: the run cannot be read.
         ArgumentError: nothing was answered in it.
     """
     samples = defaultdict[str, list[Sample]](list)

@@ -59,7 +59,7 @@ class ArmBlame:
     rerun_errors: Mapping[int, str]
     """Failures whose rerun ended with an error, by episode: which rerun, and why."""
     recovery: Mapping[str, Estimate]
-    """By rerun, percent of `episodes` that succeed; empty where there are none."""
+    """By rerun, percent of `episodes` that succeed; empty if there are none."""
     scheme: Scheme = LOOP
 
     @property
@@ -184,7 +184,7 @@ def _verdict_cells(line: ArmBlame) -> list[str]:
 
 
 def read_blame(run: RunStore) -> Blame | None:
-    """Return the verdicts on a run's failures so far; None where none was rerun.
+    """Return the verdicts on a run's failures so far; None if none was rerun.
 
     None too where another judge's marks are read than the run's own, by which reruns are failures.
     """
@@ -252,7 +252,7 @@ def _read_arm(run: RunStore, arm: str, reruns: Mapping[tuple[str, int], Mapping[
 
 
 def _find_error(rows: Mapping[str, Mapping[str, Any] | None]) -> str:
-    """Return the error that kept an episode from being rerun; empty where there was none."""
+    """Return the error that kept an episode from being rerun; empty if there was none."""
     for rerun, row in rows.items():
         if row is not None and row["status"] == "error":
             return f"{rerun}: {(row['error'].strip().splitlines() or ['unknown'])[-1]}"

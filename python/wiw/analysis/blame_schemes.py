@@ -46,7 +46,7 @@ class Scheme:
     verdicts: Mapping[str, str]
     """By name, each in a sentence: one per rerun that is the first to succeed, then the one where none does."""
     policy: str | None = None
-    """The only policy whose failures can be blamed on these stages; None where any policy's can."""
+    """The only policy whose failures can be blamed on these stages; None if any policy's can."""
     needs_guide: bool = True
     """Whether the task has to define the true value of plans."""
 

@@ -17,7 +17,7 @@ Done = Mapping[str, Mapping[int, Mapping[str, Any]]]
 PRIMITIVES, DECISIONS = "primitives", "decisions"
 """Units in which an anytime curve is cut."""
 MOST_CUTS = 10
-"""Most cuts of an anytime curve over decisions."""
+"""Maximum number of cuts of an anytime curve over decisions."""
 BOTH, ONE, NEITHER = "both right", "one right", "neither right"
 PAIRS = Metric("twins", "Twins", "rate", True, about="Percent of pairs of twins of which both are answered rightly.")
 
@@ -39,7 +39,7 @@ class Breakdown:
     estimates: Mapping[str, Mapping[str, Estimate]]
     """By arm, then by key."""
     base: str = ""
-    """Arm that estimates are paired differences from; empty where they are means."""
+    """Arm that estimates are paired differences from; empty if they are means."""
     arms_across: bool = False
     """Whether arms are columns, as suits few arms and many keys."""
     unit: str = "episodes"
@@ -47,7 +47,7 @@ class Breakdown:
     shown: frozenset[tuple[str, str]] = frozenset()
     """Row and column of the differences that the test, adjusted for all of the table, finds."""
     cut_unit: str = ""
-    """Unit of the cuts, "primitives" or "decisions"; empty where keys are no cuts."""
+    """Unit of the cuts, "primitives" or "decisions"; empty if keys are not cuts."""
 
     @property
     def keys(self) -> tuple[str, ...]:
@@ -101,7 +101,7 @@ class Breakdown:
 
 
 def split_by_kind(done: Done, metrics: Sequence[Metric], kind: str, seed: int) -> list[Breakdown]:
-    """Return a table per metric, by kind of episode; none where there is one kind.
+    """Return a table per metric, by kind of episode; none if there is one kind.
 
     Args:
         done: see `Done`.

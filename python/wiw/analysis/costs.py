@@ -15,19 +15,19 @@ COLUMNS = (
     ("consulted", "Decisions per episode that consulted the world model."),
     ("rollouts", "Imagined futures per episode, from the model or the cache."),
     ("frames", "Frames of these rollouts."),
-    ("calls", "Batches per episode sent to the model; episodes that share a batch divide it."),
+    ("calls", "Batches per episode sent to the model; a batch is divided among the episodes that share it."),
     ("cached", "Share of the rollouts from the cache."),
-    ("tokens", "Tokens per episode that a language model read and wrote."),
+    ("tokens", "Tokens per episode read and written by a language model."),
     ("model s", "Seconds per episode inside the world model."),
     ("all s", "Seconds per episode, all stages."),
     ("rollouts / success", "Rollouts of the arm divided by its successes."),
     ("s / success", "Seconds of the arm divided by its successes."),
 )
 """Columns of the table and their meaning."""
-PRICE_COLUMN = ("$", "Dollars per episode for a language model, of those whose prices are known (--vlm-prices).")
+PRICE_COLUMN = ("$", "Dollars per episode for language models with known prices (--vlm-prices).")
 """Further column, where any price is known."""
 LOST_COLUMNS = (
-    ("lost calls", "Calls per episode for decisions that were interrupted by an error; in no other column."),
+    ("lost calls", "Calls per episode for decisions that were interrupted by an error; not counted in other columns."),
     ("lost s", "Seconds per episode on them."),
 )
 """Further columns, where anything was lost."""
@@ -58,7 +58,7 @@ class Costs:
         return sum(seconds for stage, seconds in self.seconds.items() if stage != "replay")
 
     def per_success(self, total: float) -> float:
-        """Return a total divided by the number of successes; inf where there is none."""
+        """Return a total divided by the number of successes; inf if there is none."""
         return total / self.successes if self.successes else math.inf
 
     def as_dict(self) -> dict[str, Any]:

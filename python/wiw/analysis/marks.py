@@ -47,21 +47,23 @@ class Marks:
         found = [f"Marks by judge {self.judge.full_label}{own}."]
         if self.is_approximate:
             counts = ", ".join(f"{count} of {arm}" for arm, count in self.approximate.items() if count)
-            found.append(f"{APPROXIMATE}: with approximate marks, free text compared by its words alone ({counts}).")
             found.append(
-                "Nobody has shown that approximate marks agree with people or language models; `wiw judge RUN --llm "
-                "URL` asks one."
+                f"{APPROXIMATE}: with approximate marks: free text is compared only by word overlap ({counts})."
+            )
+            found.append(
+                "Approximate marks have not been shown to agree with people or language models; `wiw judge RUN --llm "
+                "URL` uses a language model."
             )
         if self.missing:
             count = "1 episode has" if self.missing == 1 else f"{self.missing} episodes have"
-            found.append(f"{count} no mark by this judge: `wiw judge RUN` with it asks for what is missing.")
+            found.append(f"{count} no mark by this judge: `wiw judge RUN` with it requests the missing marks.")
         return found
 
 
 def read_marks(
     judge: JudgeRecord | None, outcomes: Iterable[Mapping[str, Any]], arms: Sequence[str], tables: TableSpec
 ) -> Marks | None:
-    """Return whose marks outcomes have; None where no marks are given."""
+    """Return whose marks outcomes have; None if no marks are given."""
     if judge is None:
         return None
     approximate, missing = dict.fromkeys(arms, 0), 0

@@ -54,7 +54,7 @@ def find_pilot(task: str) -> Pilot:
     """
     if task not in PILOTS:
         raise ArgumentError(
-            f"power: no pilot of task '{task}'; there are {', '.join(PILOTS)}, or give a run of your own"
+            f"power: no pilot for task '{task}'; choose from {', '.join(PILOTS)}, or give your own run with --pilot"
         )
     return PILOTS[task]
 
@@ -63,7 +63,7 @@ def read_pilot(run: Run, arm: str, base: str) -> Pilot:
     """Return what two arms of a run say of the next one's size.
 
     Raises:
-        ArgumentError: an arm is not there, or fewer than two episodes are scored in both.
+        ArgumentError: an arm does not exist, or fewer than two episodes are scored in both.
     """
     for name in (arm, base):
         if name not in run.arms:

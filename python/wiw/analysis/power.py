@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""How many episodes a run needs, or what it can show, before it is run."""
+"""Compute how many episodes a run needs, or what it can show, before running it."""
 
 from __future__ import annotations
 
@@ -17,11 +17,12 @@ from wiw.analysis.simulate import draw_outcome_counts, sum_by_scene
 from wiw.errors import ArgumentError
 
 BASE, LOSSES, CORRELATION, PER_SCENE = 20.0, 2.0, 0.05, 5
-"""Near what 210 test episodes of Image-Goal Navigation in 42 apartments gave (`docs/results.md`): 18 % succeed without
-a world model; the oracle wins 76 more and loses 4; paired differences correlate within apartments by -0.06 to 0.06."""
+"""Close to what was measured on 210 test episodes of Image-Goal Navigation in 42 apartments (`docs/results.md`): 18 %
+succeed without a world model; the oracle wins 76 more and loses 4; paired differences correlate within apartments by
+-0.06 to 0.06."""
 MOST_SCENES = 100_000
 LEAST = 0.1
-"""Points; differences are sought in such steps."""
+"""Step of the search for a difference, in points."""
 _DRAWS = 2_000_000
 
 
@@ -30,23 +31,23 @@ class Power:
     """The result of `wiw.power`; its string form is a sentence or two."""
 
     difference: float
-    """Points of success rate between two arms that the run shows."""
+    """Difference in success rate between two arms that the run shows, in points."""
     base: float
-    """Success rate of the arm compared with, percent."""
+    """Success rate of the base arm, percent."""
     losses: float
-    """Percent of episodes that only the worse arm succeeds in: the one compared with, if the difference is positive."""
+    """Percent of episodes in which only the worse arm succeeds: the base, if the difference is positive."""
     correlation: float
-    """Correlation of the differences of two episodes of a scene."""
+    """Correlation between the differences in two episodes of a scene."""
     per_scene: int
     arms: int
     wanted: float
-    """Chance of showing the difference that was asked for."""
+    """Requested chance of showing the difference."""
     scenes: int
-    """Needed."""
+    """Number of scenes needed."""
     by_interval: float
-    """Chance, in simulated runs, that the 95 % interval of the difference excludes 0 on its side."""
+    """Chance, in simulated runs, that the 95 % interval of the difference excludes 0 on the right side."""
     by_test: float
-    """The same for the test that p in tables is of (`wiw.analysis.flip_test`)."""
+    """The same for the test behind the p values in tables (`wiw.analysis.flip_test`)."""
 
     @property
     def episodes(self) -> int:
@@ -55,12 +56,12 @@ class Power:
 
     @property
     def won(self) -> float:
-        """Percent of episodes that only the arm under test succeeds in."""
+        """Percent of episodes in which only the arm under test succeeds."""
         return self.losses + max(self.difference, 0.0)
 
     @property
     def lost(self) -> float:
-        """Percent of episodes that only the arm compared with succeeds in."""
+        """Percent of episodes in which only the base arm succeeds."""
         return self.losses + max(-self.difference, 0.0)
 
     def __str__(self) -> str:
@@ -88,34 +89,35 @@ def power(
     arms: int = 1,
     seed: int = 0,
 ) -> Power:
-    """Return the scenes that a run needs to show a paired difference of success rates, or what a run can show.
+    """Return the number of scenes needed to show a paired difference of success rates, or what a run can show.
 
-        wiw.power(10)              # +10 points to 20 %, in apartments
-        wiw.power(10, arms=4)      # the same as one of four arms, whose p values Holm adjusts
+        wiw.power(10)              # 20 % plus 10 points, in apartments
+        wiw.power(10, arms=4)      # the same for one of four arms, with Holm-adjusted p values
         wiw.power(scenes=40)       # what 200 episodes in 40 scenes can show
 
-    The fewest scenes for which the interval of the difference excludes 0 often enough are found by a noncentral t
-    distribution, and the chance is then measured in simulated runs; scenes are added until it is what was asked for.
-    The least difference is sought in simulated runs, to a tenth of a point.
+    The smallest number of scenes for which the interval of the difference excludes 0 often enough is computed with a
+    noncentral t distribution; the chance is then measured in simulated runs, and scenes are added until it is reached.
+    The smallest difference is searched for in simulated runs, to a tenth of a point.
 
     Args:
-        difference: in points; positive if the arm under test is better. None: the least that `scenes` can show.
-        scenes: of the run; None: as many as `difference` needs.
-        base: success rate of the arm it is compared with, percent.
-        losses: percent of episodes in which the worse arm succeeds and the better one does not. Fewer: arms are more
-            alike, so that less is left to chance.
-        correlation: between the differences of two episodes of one scene, in [0, 1).
+        difference: in points; positive if the arm under test is better. None: the smallest that `scenes` can show.
+        scenes: number of scenes; None: as many as `difference` needs.
+        base: success rate of the base arm, percent.
+        losses: percent of episodes in which the worse arm succeeds and the better one does not. The fewer, the more
+            similar the arms, and the less is left to chance.
+        correlation: correlation between the differences in two episodes of one scene, in [0, 1).
         per_scene: episodes in each scene.
-        chance: of showing the difference, if there is one.
-        arms: compared with the same base; the strictest step of Holm's adjustment is reckoned with.
-        seed: of the simulation.
+        chance: chance of showing the difference, if there is one.
+        arms: number of arms compared with the same base; the strictest step of Holm's adjustment is assumed.
+        seed: seed of the simulation.
 
     Raises:
-        ArgumentError: numbers that no run could have; both a difference and scenes, or neither.
+        ArgumentError: impossible numbers; both a difference and scenes, or neither.
     """
     if (difference is None) == (scenes is None):
         raise ArgumentError(
-            "power: expected either a difference, for the scenes it needs, or scenes, for what they show"
+            "power: expected either a difference (to compute the scenes it needs) or a number of scenes (to compute "
+            "what they can show)"
         )
     plan = _Plan(losses, correlation, per_scene, chance, 1 - 0.05 / arms if arms > 0 else 0.0, seed)
     if difference is not None:
@@ -143,30 +145,30 @@ class _Plan:
     seed: int
 
     def scenes_for(self, difference: float) -> tuple[int, tuple[float, float]]:
-        """Return the fewest scenes, and their power by interval and by test."""
+        """Return the smallest number of scenes, and its power by interval and by test."""
         rng = self._rng()
-        scenes = self._fewest(difference)
+        scenes = self._find_fewest_scenes(difference)
         while (shares := self._simulate(difference, scenes, rng))[0] < self.chance:
             scenes += max(1, scenes // 25)
         return scenes, shares
 
     def difference_for(self, scenes: int, most: float) -> tuple[float, tuple[float, float]]:
-        """Return the least difference up to `most`, to a tenth of a point, and its power."""
+        """Return the smallest difference up to `most`, to a tenth of a point, and its power."""
 
         @cache
-        def shown(tenths: int) -> tuple[float, float]:
+        def simulate_difference(tenths: int) -> tuple[float, float]:
             return self._simulate(tenths / 10, scenes, self._rng())
 
         least, end = 1, int(10 * most + 1e-9)
-        if end < least or shown(end)[0] < self.chance:
+        if end < least or simulate_difference(end)[0] < self.chance:
             raise ArgumentError(
-                f"power: {scenes * self.per_scene} episodes in {scenes} scenes show no difference up to {most:g} "
-                f"points with a chance of {100 * self.chance:g} %; take more scenes"
+                f"power: {scenes * self.per_scene} episodes in {scenes} scenes cannot show a difference of up to "
+                f"{most:g} points with a chance of {100 * self.chance:g} %; take more scenes"
             )
         while least < end:
             middle = (least + end) // 2
-            least, end = (least, middle) if shown(middle)[0] >= self.chance else (middle + 1, end)
-        return end / 10, shown(end)
+            least, end = (least, middle) if simulate_difference(middle)[0] >= self.chance else (middle + 1, end)
+        return end / 10, simulate_difference(end)
 
     def _rng(self) -> np.random.Generator:
         return np.random.Generator(np.random.Philox(key=self.seed))
@@ -175,10 +177,10 @@ class _Plan:
         lost, won = self.losses / 100, (self.losses + difference) / 100
         return simulate_power(won, lost, scenes, self.per_scene, self.correlation, self.confidence, rng)
 
-    def _fewest(self, difference: float) -> int:
-        """Return the fewest scenes by the formula."""
+    def _find_fewest_scenes(self, difference: float) -> int:
+        """Return the smallest number of scenes according to the formula."""
         least, most = 2, 2
-        while not self._enough(difference, most):
+        while not self._has_enough_power(difference, most):
             if most > MOST_SCENES:
                 raise ArgumentError(
                     f"power: a difference of {difference:g} points needs more than {MOST_SCENES} scenes"
@@ -186,10 +188,10 @@ class _Plan:
             least, most = most, 2 * most
         while least < most:
             middle = (least + most) // 2
-            least, most = (least, middle) if self._enough(difference, middle) else (middle + 1, most)
+            least, most = (least, middle) if self._has_enough_power(difference, middle) else (middle + 1, most)
         return most
 
-    def _enough(self, difference: float, scenes: int) -> bool:
+    def _has_enough_power(self, difference: float, scenes: int) -> bool:
         """Return whether scenes show a difference often enough, by the noncentral t distribution."""
         gain, discordant = difference / 100, (2 * self.losses + difference) / 100
         spread = (discordant - gain**2) * (1 + (self.per_scene - 1) * self.correlation) / self.per_scene
@@ -207,7 +209,7 @@ def simulate_power(
     confidence: float,
     rng: np.random.Generator,
 ) -> tuple[float, float]:
-    """Return the shares of simulated runs whose interval, and whose test, show which arm is better."""
+    """Return the shares of simulated runs in which the interval, and the test, show which arm is better."""
     runs = max(400, min(8000, _DRAWS // scenes))
     sizes = [per_scene] * scenes
     counts = draw_outcome_counts([won, lost, 1 - won - lost], sizes, correlation, runs, rng)
@@ -227,8 +229,8 @@ def _check(
         (difference != 0, f"a difference other than 0, got {difference:g}"),
         (0 <= base <= 100, f"base from 0 to 100 %, got {base:g}"),
         (losses >= 0, f"losses of at least 0 %, got {losses:g}"),
-        (only_base <= base, f"no more than the base's {base:g} % of episodes lost, got {only_base:g} %"),
-        (only_arm <= 100 - base, f"no more than the {100 - base:g} % that the base fails in won, got {only_arm:g} %"),
+        (only_base <= base, f"at most the base's {base:g} % of episodes lost, got {only_base:g} %"),
+        (only_arm <= 100 - base, f"at most the {100 - base:g} % in which the base fails won, got {only_arm:g} %"),
         (0 <= correlation < 1, f"correlation in [0, 1), got {correlation:g}"),
         (per_scene >= 1, f"per_scene of at least 1, got {per_scene}"),
         (0 < chance < 1, f"chance between 0 and 1, got {chance:g}"),

@@ -203,14 +203,15 @@ def _list_caveats(found: Sequence[Correlation]) -> list[str]:
     """Return in plain words what so few arms can show."""
     arms = max((one.arms for one in found), default=0)
     if arms < LEAST:
-        return [f"A rank correlation needs at least {LEAST} arms with imagined frames; here are {arms}."]
+        return [f"A rank correlation needs at least {LEAST} arms with imagined frames; this table has {arms}."]
     if arms >= FEW_ARMS:
         return [_explain_draws(found)]
     least = min(1.0, 2 / math.factorial(arms))
     chance = f"{100 * least:.2g} % of the time"
     weak = " Nothing can be significant at 5 % here, whatever the numbers." if least > 0.05 else ""
     return [
-        f"{arms} arms prove little: a random order of {arms} arms is perfect, up or down, {chance}.{weak}",
+        f"{arms} arms prove little: a random order of {arms} arms is perfect, increasing or decreasing, "
+        f"{chance}.{weak}",
         _explain_draws(found),
     ]
 
@@ -219,13 +220,12 @@ def _explain_draws(found: Sequence[Correlation]) -> str:
     """Return what the intervals of the coefficients speak of."""
     one = max(found, key=lambda each: each.arms)
     if one.units < FEW:
-        return f"No intervals of rank correlations: {one.units} {one.unit} are too few, they take at least {FEW}."
+        return f"No intervals for rank correlations: {one.units} {one.unit} are too few; at least {FEW} are needed."
     left = [each.defined for each in found if not math.isnan(each.rho)]
     equal = 100 * (1 - min(left, default=1.0))
-    out = (
-        f" In up to {equal:.0f} % of the draws the arms cannot be ordered; these are left out." if equal >= 0.5 else ""
-    )
+    out = f" In up to {equal:.0f} % of the resamples the arms cannot be ranked; these are left out."
+    out = out if equal >= 0.5 else ""
     return (
-        f"Intervals of rank correlations come from drawing the {one.units} {one.unit} anew with these arms given.{out} "
-        "They say nothing of other models, and they are too narrow below some thirty scenes."
+        f"Intervals for rank correlations come from resampling the {one.units} {one.unit}, with these arms fixed.{out} "
+        "They say nothing about other models, and are too narrow with fewer than about thirty scenes."
     )

@@ -34,7 +34,7 @@ class Correlation:
     rho: float
     """Spearman's coefficient over the arms, -1 to 1; NaN below three arms, and where all are equal in one."""
     low: float
-    """Lower end of the 95 % interval from resampling scenes with the arms fixed; NaN where there is none."""
+    """Lower end of the 95 % interval from resampling scenes with the arms fixed; NaN if there is none."""
     high: float
     p: float
     """Two-sided, exact to eight arms: how often a random order of the arms is as extreme."""
@@ -60,7 +60,7 @@ def correlate(
         measure: name of the values.
         success: float64 [arms, episodes], no NaN.
         values: float64 [arms, episodes], NaN in the episodes in which it was not measured.
-        scenes: [episodes] labels. Whole scenes are drawn with replacement; episodes where there is one scene.
+        scenes: [episodes] labels. Whole scenes are drawn with replacement; episodes if there is one scene.
         seed: the draws are a function of it alone.
 
     Raises:

@@ -25,12 +25,12 @@ UNDERSTOOD = (
 
 @dataclass(frozen=True)
 class Look:
-    """Findings of a look at a run that goes on."""
+    """Findings of one look at a run in progress."""
 
     episodes: int
     """Per arm, so far."""
     of: int
-    """Most episodes that the run may have per arm."""
+    """Maximum number of episodes per arm."""
     text: str
     """E.g. "oracle-none +31.2 [3.0, 60.1] over 12 scenes"."""
     is_enough: bool
@@ -48,7 +48,7 @@ class StopRule:
     targets: tuple[tuple[str, ...], ...]
     """Each an arm, or an arm and the one that it is compared with."""
     width: float | None
-    """Points below which every target's interval must be; None where it must exclude 0."""
+    """Points below which every target's interval must be; None if it must exclude 0."""
     every: int
     """Episodes per arm between two looks."""
 
@@ -142,7 +142,7 @@ def parse_stop_rule(text: str, arms: Sequence[str], every: int) -> StopRule:
     if match := re.fullmatch(r"(.+?) excludes 0", compact):
         target = _read_target(match[1], arms, text)
         if len(target) == 1:
-            raise _refuse(text, arms, f"'{match[1]}' is one arm, whose SR is no difference")
+            raise _refuse(text, arms, f"'{match[1]}' is a single arm, not a difference")
         return StopRule(compact, (target,), None, every)
     if match := re.fullmatch(r"width ?(?:\((.+)\))? ?< ?(\d+(?:\.\d+)?)", compact):
         targets = (_read_target(match[1], arms, text),) if match[1] else tuple((arm,) for arm in arms)

@@ -46,10 +46,10 @@ ROLES = {
 PLACEBOS = {
     "placebo-shuffled": "control: same compute, futures of shuffled actions",
     "placebo-swapped": "control: same compute, futures of another episode",
-    "placebo-blind": "control: same compute, the model is told no plan",
+    "placebo-blind": "control: same compute, the model is not told the plan",
 }
 """Arms with the compute of a world model and uninformative imagination; ":" and a model's name may follow."""
-REPEATS = {RESEEDED: "noise floor: the same with other random numbers"}
+REPEATS = {RESEEDED: "noise floor: the same arm with other random numbers"}
 """Arms that repeat another one of the run; ":" and a model's name follow."""
 ERROR = "error-"
 """Beginning of the names of arms whose futures have an error of a known dose."""
@@ -107,7 +107,7 @@ class Group:
 
 TRACKED = {
     "frames": "their pixels",
-    "poses": "the poses that were asked for, whatever the frames show",
+    "poses": "the requested poses, regardless of what the frames show",
 }
 """Words for each thing that a tracker follows."""
 
@@ -143,7 +143,7 @@ class Summary:
     departures: tuple[Departure, ...] = field(default=(), kw_only=True)
     """Where the run departs from the paper's protocol."""
     tiers: Mapping[str, Summary] = field(default_factory=dict, kw_only=True)
-    """The same numbers of each tier of episodes by itself, where the run has several."""
+    """The same numbers for each tier of episodes separately, where the run has several."""
 
     @property
     def protocol(self) -> str:
@@ -327,7 +327,7 @@ def _describe_unusable(arm: str, kinds: Mapping[str, int]) -> str:
     reasons = ", ".join(f"{kind} {count}" for kind, count in sorted(problems.items(), key=lambda each: -each[1]))
     return (
         f"{arm}: {unusable} of {asked} answers of its language model ({100 * unusable / asked:.0f} %) could not be "
-        f"used ({reasons}). What stood in for them, such as a primitive that was drawn, is scored."
+        f"used ({reasons}). Fallbacks, such as a randomly drawn primitive, were used instead and are scored."
     )
 
 
@@ -335,16 +335,16 @@ def _describe_looks(info: Mapping[str, Any]) -> str:
     """Return the rule by which a run was to stop early, and whether it did."""
     if "until" not in info:
         return ""
-    rule = f"The run was looked at every {info['until']['every']} episodes, to stop once {info['until']['rule']}."
-    ended = f"It stopped at {info['stopped']['why']}." if "stopped" in info else "It was not stopped so far."
+    rule = f"The run was checked every {info['until']['every']} episodes, to stop once {info['until']['rule']}."
+    ended = f"It stopped at {info['stopped']['why']}." if "stopped" in info else "It has not been stopped so far."
     return (
-        f"{rule} {ended} That interval is of a confidence sequence, and p of a betting test over scenes: both hold at "
-        "any look. The intervals in the tables are for a number of episodes that is fixed beforehand."
+        f"{rule} {ended} That interval is from a confidence sequence, and p from a betting test over scenes: both are "
+        "valid at any time. The intervals in the tables are for a number of episodes that is fixed in advance."
     )
 
 
 def _summarise_tiers(run: Run, outcomes: Sequence[Mapping[str, Any]], policies: Collection[str]) -> dict[str, Summary]:
-    """Return the numbers of each tier of episodes; nothing where there is one tier, or none."""
+    """Return the numbers of each tier of episodes; nothing if there is one tier, or none."""
     episodes = run.store.episodes()
     own = run.store.own_episodes() if "stopped" in run.store.info else range(len(episodes))
     tiers = dict.fromkeys(episodes[index].tier for index in own)
@@ -385,7 +385,7 @@ def arm_table(run: Run) -> Records:
 
 
 def tier_table(run: Run) -> Records:
-    """Return the same of each tier of episodes by itself, with its name as "tier"; empty without several."""
+    """Return the same for each tier of episodes separately, with its name as "tier"; empty unless there are several."""
     tiers = summarise_run(run).tiers
     return Records({"tier": tier, **line} for tier, own in tiers.items() for line in _list_lines(own))
 
@@ -603,11 +603,11 @@ def _explain_intervals(summary: Summary) -> list[str]:
     few = ""
     if first.effective_scenes < first.scenes / 2:
         few = (
-            f" Their numbers of episodes are so unequal that they count as {first.effective_scenes:.1f}: run "
-            "equally many in each (--per-scene)."
+            f" Their numbers of episodes are so unequal that they count as {first.effective_scenes:.1f}: run the same "
+            "number in each (--per-scene)."
         )
     elif first.scenes < FEWEST_SCENES:
-        few = " Few scenes make them wide: add scenes rather than episodes per scene."
+        few = " With so few scenes they are wide: add scenes rather than episodes per scene."
     return [f"95 % intervals over {first.scenes} scenes.{few}"]
 
 
@@ -615,16 +615,16 @@ def _explain_differences(summary: Summary) -> list[str]:
     first = next((difference.estimate for difference in summary.differences), None)
     if first is None:
         return []
-    what = "whole scenes change sides (exact sign-flip test)"
+    what = "exact sign-flip test over scenes"
     if summary.looks:
-        what = "a betting test over scenes, which holds at any look; none of lengths"
+        what = "a betting test over scenes, valid at any time; none for lengths"
     elif first.scenes == 1:
-        what = "episodes change sides (exact sign-flip test); it says nothing of other scenes"
+        what = "exact sign-flip test over episodes; it says nothing about other scenes"
     elif first.scenes < FEWEST_SCENES:
-        what = "the t test of the interval, as there are too few scenes for an exact one"
+        what = "the interval's t test, as there are too few scenes for an exact one"
     return [
-        f"p: {what}, Holm-adjusted for the arms in its table. Bold: adjusted p of at most {LEVEL:g}, SR by itself, the "
-        "other columns together. Intervals are not adjusted."
+        f"p: {what}, Holm-adjusted over the arms in its table. Bold: adjusted p of at most {LEVEL:g} (SR's "
+        "p values are adjusted on their own, those of the other columns together). Intervals are not adjusted."
     ]
 
 
@@ -644,7 +644,7 @@ def _explain_partial(summary: Summary) -> list[str]:
         counts = [(line.estimates[metric.name].n, line.done) for line in summary.arms if metric.name in line.estimates]
         if any(known < done for known, done in counts):
             known, done = min(counts)
-            found.append(f"{metric.label}: over the episodes for which it is known, {known} of {done} at least.")
+            found.append(f"{metric.label}: over the episodes for which it is known, at least {known} of {done}.")
     return found
 
 

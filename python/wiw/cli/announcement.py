@@ -46,7 +46,7 @@ def announce(task: Task, arms: Mapping[str, Any], config: RunConfig) -> None:
 
 
 def _describe_rule(config: RunConfig, arms: list[str]) -> str:
-    """Return the rule by which the run stops early.
+    """Return the rule that may stop the run early.
 
     Raises:
         ArgumentError: one that is not understood.
@@ -54,11 +54,11 @@ def _describe_rule(config: RunConfig, arms: list[str]) -> str:
     from wiw.analysis.stopping import parse_stop_rule
 
     rule = parse_stop_rule(str(config.until), arms, config.look_every)
-    return f"{rule.text}; a look every {count_noun(rule.every, 'episode')} per arm"
+    return f"{rule.text}; checked every {count_noun(rule.every, 'episode')} per arm"
 
 
 def announce_protocol(task: Task, arms: Mapping[str, Any], episodes: int) -> None:
-    """Print what a task's preset sets, and where a run of so many episodes departs from the paper, with reasons."""
+    """Print a task's preset, and where a run of so many `episodes` departs from the paper, with reasons."""
     from wiw.cli.presets import list_settings
     from wiw.runs.departures import find_departures
     from wiw.tasks.presets import find_owner
@@ -68,7 +68,7 @@ def announce_protocol(task: Task, arms: Mapping[str, Any], episodes: int) -> Non
         for line in list_settings(find_owner(type(task)), task.preset):
             print(f"  sets {line}")
     found = find_departures(task, arms, episodes)
-    print("departs from the paper" if found else "nothing departs from the paper")
+    print("departures from the paper" if found else "no departures from the paper")
     for departure in found:
         print(f"  {printable(departure)}")
 

@@ -54,45 +54,45 @@ DESCRIPTION = """Does a world model help an agent succeed, and by how much?
 An agent uses a world model to imagine the outcome of each candidate plan, picks one plan and acts. `wiw run` does this
 on a task, for one world model or several on the same episodes, and measures how much each raises task success.
 
-  $ wiw demo                                              five world models side by side, in some minutes
+  $ wiw demo                                              five world models side by side, in a few minutes
   $ wiw list                                              world models, policies, tasks, metrics, presets
   $ wiw run imagenav --world-model warp --episodes 50     one world model
-  $ wiw check-model my_model.py:MyModel                   is your own model ready to run?
+  $ wiw check-model my_model.py:MyModel                   does your own model work?
   $ wiw run imagenav --world-model my_model.py:MyModel --arms none,copy,oracle
-                                                          your own, beside floor and ceiling
+                                                          your own, next to floor and ceiling
   $ wiw report runs/NAME                                  table and HTML report of a run
   $ wiw compare runs/NAME runs/OTHER                      is the difference more than chance?
 
-`wiw COMMAND --help` explains each command with examples. `--debug` shows the whole traceback of an error.
+`wiw COMMAND --help` explains each command with examples. `--debug` shows the full traceback of an error.
 
-Exit codes: 0 done, 1 the run is invalid (verify: something differs; judge: marks are missing), 2 error, 130 stopped by
-Ctrl-C, 75 stopped by SIGTERM or SIGUSR2, within 6 seconds. A stopped run keeps everything recorded; `wiw resume`
-continues it."""
+Exit codes: 0 success, 1 the run is invalid (verify: something differs; judge: marks are missing), 2 error, 130 stopped
+by Ctrl-C, 75 stopped within 6 seconds by SIGTERM or SIGUSR2. A stopped run keeps everything recorded so far; `wiw
+resume` continues it."""
 
 COMMANDS: tuple[tuple[Callable[..., int], str, str], ...] = (
-    (demo, "demo", "Watch it work: a few arms on a handful of episodes, a table and a report."),
+    (demo, "demo", "See it work: several world models on a few episodes of each task, with tables and reports."),
     (list_names, "list", "List world models, policies, trackers, tasks, presets and metrics."),
     (run, "run", "Run an agent on a task, with one world model or several."),
     (resume, "resume", "Resume a run that was stopped."),
-    (status, "status", "Show how far runs are, while they are being run or after."),
+    (status, "status", "Show the progress of runs, finished or not."),
     (submit, "submit", "Run an agent in shards, as an array of SLURM jobs."),
     (cancel, "cancel", "Cancel the jobs of a run."),
-    (merge, "merge", "Merge the shards of a run, run on several machines, into one run."),
+    (merge, "merge", "Merge the shards of a run from several machines into one run."),
     (blame, "blame", "Find the stage that causes a run's failures."),
-    (judge, "judge", "Judge the stored answers of a run again, by rules or a language model."),
+    (judge, "judge", "Judge the stored answers of a run again, with rules or a language model."),
     (compare, "compare", "Compare two runs on the same episodes."),
-    (power, "power", "Compute how many episodes a run needs to show a difference."),
-    (quality, "quality", "Visual quality and controllability of imagined frames, against success."),
-    (scale, "scale", "Success against the number of imagined futures."),
+    (power, "power", "Compute how many episodes are needed to show a difference."),
+    (quality, "quality", "Compare success with the visual quality and controllability of imagined frames."),
+    (scale, "scale", "Measure success against the number of imagined futures."),
     (report, "report", "Print the tables of a run and write its HTML report."),
     (export, "export", "Export a run as CSV or Parquet tables, or as a Rerun recording."),
     (verify, "verify", "Rerun some episodes of a run and compare them with the record."),
     (view, "view", "Write HTML pages to browse a run, decision by decision."),
     (check_model, "check-model", "Check a world model against its contract."),
     (serve, "serve", "Serve a world model to other processes or machines."),
-    (doctor, "doctor", "Check this machine, with a remedy for what is missing."),
+    (doctor, "doctor", "Check this machine, and say how to fix what is missing."),
     (serve_vlm, "serve-vlm", "Serve a small vision-language model on this machine, for tests."),
-    (episodes, "episodes", "Write episodes to a file, so that anyone can run them."),
+    (episodes, "episodes", "Write episodes to a file that anyone can run."),
 )
 
 
@@ -101,45 +101,45 @@ class Group:
     """Commands of two words."""
 
     line: str
-    """Summary shown in the list of commands."""
+    """The summary shown in the list of commands."""
     description: str
     commands: tuple[tuple[Callable[..., int], str, str], ...]
     default: str | None = None
-    """The second word where none is given."""
+    """The second word if none is given."""
     default_takes_words: bool = False
-    """Whether that is also where the second word is no command, but a word of the default command."""
+    """Whether a second word that is not a command is taken as an argument of the default command."""
     needs_words: bool = False
-    """Whether the default command cannot be run without words, so that none at all asks for help."""
+    """Whether the default command needs arguments, so that without any the help is shown."""
 
 
 GROUPS: Mapping[str, Group] = {
     "scenes": Group(
-        "Draw scenes and print their sizes, or check the scans of a dataset.",
-        """Draw scenes and print their sizes, or check the scans of a dataset.
+        "Draw scenes and print their sizes, or check the scans in a dataset.",
+        """Draw scenes and print their sizes, or check the scans in a dataset.
 
   $ wiw scenes apartments:val:4
   $ wiw scenes house.glb --out house.png
   $ wiw scenes verify hm3d:scene_datasets/hm3d:val""",
         (
-            (draw_scenes, "draw", "Print sizes of scenes and draw a contact sheet; what `wiw scenes SPEC` does."),
-            (verify_scans, "verify", "Open every scan of a dataset, and print what is wrong."),
+            (draw_scenes, "draw", "Print the sizes of scenes and draw a contact sheet; `wiw scenes SPEC` for short."),
+            (verify_scans, "verify", "Open every scan in a dataset and print what is wrong."),
         ),
         default="draw",
         default_takes_words=True,
     ),
     "collect": Group(
-        "Collect data: navigation in scenes, demonstrations of manipulation tasks, or decisions.",
-        """Collect data for training, and decisions to validate on. Repeat an interrupted command to resume it.
+        "Collect data: navigation through scenes, demonstrations of manipulation tasks, or decisions.",
+        """Collect training data, and decisions for validation. To resume an interrupted command, repeat it.
 
   $ wiw collect navigation --scenes apartments:train:80 --out data --workers 4
   $ wiw collect manipulation --out demos --workers 4
   $ wiw collect decisions --scenes apartments:val:20 --out decisions.parquet
 
-`wiw collect WHAT --help` explains each with examples.""",
+`wiw collect NAME --help` explains each with examples.""",
         (
             (collect_navigation, "navigation", "Panoramas with depth, poses and actions along paths through scenes."),
-            (collect_manipulation, "manipulation", "Demonstrations of manipulation tasks by scripted experts."),
-            (collect_decisions, "decisions", "Decisions between plans, with what each would truly lead to."),
+            (collect_manipulation, "manipulation", "Demonstrations of the manipulation tasks by scripted experts."),
+            (collect_decisions, "decisions", "Decisions between plans, with the true outcome of each plan."),
         ),
         default="manipulation",
     ),
@@ -157,8 +157,8 @@ All but video models train on a CPU, in minutes to hours. Repeat an interrupted 
         TRAININGS,
     ),
     "data": Group(
-        "Check, summarise or draw a navigation dataset; convert collected data to LeRobot's format and back.",
-        """Check, summarise or draw a dataset of `wiw collect navigation`; convert what `wiw collect` has collected.
+        "Check, summarise or draw a navigation dataset; convert collected data to and from LeRobot's format.",
+        """Check, summarise or draw a dataset of `wiw collect navigation`; convert data to and from LeRobot's format.
 
   $ wiw data verify data
   $ wiw data stats data
@@ -167,30 +167,30 @@ All but video models train on a CPU, in minutes to hours. Repeat an interrupted 
         (
             (verify_data, "verify", "Check every file, frame and split."),
             (stats_data, "stats", "Print frames, actions, lengths, coverage and sizes."),
-            (show_data, "show", "Draw maps of what is covered, and a contact sheet of clips."),
-            (export_data, "export", "Write navigation or manipulation data as a LeRobot dataset, format v3.0."),
-            (import_data, "import", "Write the collection that a LeRobot dataset was exported from."),
+            (show_data, "show", "Draw maps of coverage and a contact sheet of clips."),
+            (export_data, "export", "Convert navigation or manipulation data to a LeRobot dataset, format v3.0."),
+            (import_data, "import", "Convert an exported LeRobot dataset back to the collection it came from."),
         ),
     ),
     "bench": Group(
         "Measure this machine's GPU: rendering, small networks, memory.",
-        """Measure what this machine does for wiw.
+        """Measure how fast this machine runs wiw.
 
   $ wiw bench gpu --out gpu.json""",
-        ((bench_gpu, "gpu", "Rendering in batches, rollout and training step of each small network, memory."),),
+        ((bench_gpu, "gpu", "Batched rendering, rollouts and training steps of the small networks, memory."),),
         default="gpu",
     ),
     "prompts": Group(
-        "Import the prompts of your own copy of the paper.",
-        """Import the prompts of your own copy of the paper for policy vlm. `wiw list prompts` lists the shipped sets.
+        "Import the prompts from your own copy of the paper.",
+        """Import prompts from your own copy of the paper for policy vlm; `wiw list prompts` lists the built-in sets.
 
   $ wiw prompts import paper/main.tex --out prompts/paper""",
-        ((import_prompts, "import", "Write a folder of prompts from LaTeX source or published code."),),
+        ((import_prompts, "import", "Write a folder of prompts from the LaTeX source or the published code."),),
     ),
     "study": Group(
-        "Run many arms, or train many small models, to answer a question: a page with figures and tables.",
-        """Answer a question by many runs or trainings, with figures and tables on one page. Repeat an interrupted
-command to resume it. `wiw list studies` names the shipped ones, and a YAML file is a study of your own:
+        "Answer a research question with many runs or trainings; write a page with figures and tables.",
+        """Answer a research question with many runs or trainings, and write a page with figures and tables. To resume
+an interrupted study, repeat the command. `wiw list studies` lists the built-in ones; a YAML file defines your own:
 
   $ wiw study front-vs-panorama --small
   $ wiw study vlm --set server=http://localhost:8000/v1 --set model=qwen2.5-vl-72b-awq
@@ -199,29 +199,29 @@ command to resume it. `wiw list studies` names the shipped ones, and a YAML file
   $ wiw study data-scaling --small --workers 2
   $ wiw study my.yaml --set episodes=100
 
-my.yaml, in full:
+A complete my.yaml:
 
   title: Does a longer horizon help?
-  about: one line for the list of studies
+  about: one line, shown in the list of studies
   variables: {model: warp, episodes: 60}       # --set model=oracle
   small: {episodes: 4}                         # --small
   runs:
-    far:                                       # a run: arms on the same episodes of one task
+    far:                                       # one run: arms on the same episodes of one task
       task: imagenav
       task_options: {scenes: "apartments:val:12", tier: far}
-      settings: {episodes: "{episodes}"}       # as of `wiw run`: seed, keep_images, fidelity, ...
-      agent: {policy: matcher, model: "{model}"}   # what the arms share
-      arms:                                    # or text as for `wiw run --arms`
+      settings: {episodes: "{episodes}"}       # as in `wiw run`: seed, keep_images, fidelity, ...
+      agent: {policy: matcher, model: "{model}"}   # shared by all arms
+      arms:                                    # or a string, as in `wiw run --arms`
         none: {model: none}
         short: {horizon: 5}
         long: {horizon: 10}
-      compare: [[long, short]]                 # paired differences, besides those from none and copy
-      plots: [success, rollouts]               # and quality, with options of `wiw quality` under `quality:`
+      compare: [[long, short]]                 # paired differences, in addition to those from none and copy
+      plots: [success, rollouts]               # also quality, with the options of `wiw quality` under `quality:`
 
-Arms take policy, model, reviser, model_options, policy_options, tracker, candidates, horizon, depth, placebo and so
-on, as `wiw.runs.recipes.AgentRecipe` has them. `wiw study WHAT --help` explains each command.""",
+An arm accepts the fields of `wiw.runs.recipes.AgentRecipe`: policy, model, reviser, model_options, policy_options,
+tracker, candidates, horizon, depth, placebo and so on. `wiw study NAME --help` explains each command.""",
         (
-            (run_study, "run", "A study by name or from a YAML file; `wiw study NAME` is short for it."),
+            (run_study, "run", "Run a study by name or from a YAML file; `wiw study NAME` for short."),
             *STUDIES,
         ),
         default="run",

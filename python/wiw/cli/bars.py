@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Bars of a collection's progress; plain lines at quarter marks where the output is no terminal."""
+"""Progress bars of a collection; plain lines at each quarter if the output is not a terminal."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ from typing import Any
 
 
 class Bars:
-    """Named bars on the standard error, which appear when they are first shown."""
+    """Named bars on standard error, which appear when they are first shown."""
 
     def __enter__(self) -> Bars:
         from rich.console import Console

@@ -20,21 +20,21 @@ def bench_gpu(
     seconds: Annotated[float, arg(metavar="SECONDS")] = 0.5,
     out: Annotated[Path | None, arg(metavar="FILE")] = None,
 ) -> int:
-    """Measure this machine's GPU: rendering in batches, rollout and training step of each small network, memory.
+    """Measure this machine's GPU: batched rendering, rollouts and training steps of the small networks, memory.
 
     $ wiw bench gpu --out gpu.json
     $ wiw bench gpu --networks warpnet,pocket --no-rendering
 
-    Views are drawn by EGL on the first hardware device, 1, 16, 64 and 256 at a time, and networks run by torch on CUDA,
-    with 1, 16 and 64 rows. On a machine without a GPU the command runs small sizes of what can run, and says what was
-    not run. Times are medians by the clock: leave the machine alone meanwhile.
+    Views are rendered with EGL on the first hardware device, 1, 16, 64 and 256 at a time, and networks run in torch on
+    CUDA with batches of 1, 16 and 64. On a machine without a GPU the command runs small versions of what it can, and
+    says what was skipped. Times are medians of wall-clock time, so leave the machine idle otherwise.
 
     Args:
-        scene: What is drawn: the spec of a single scene.
+        scene: The scene to render, as the spec of a single scene.
         networks: Some of warpnet, armnet, navigator, recogniser, perception, pocket, diffuser.
-        rendering: Whether views are drawn.
-        seconds: Time for each figure.
-        out: JSON file with all figures, the device's name and the platform.
+        rendering: Whether to measure rendering.
+        seconds: Seconds to spend on each measurement.
+        out: JSON file for all measurements, the device's name and the platform.
     """
     from wiw.cli.bars import Bars
     from wiw.studies.device_benchmark import benchmark_device

@@ -35,38 +35,37 @@ def blame(
 
     Reruns every failure with ground truth in one stage at a time, with the same random numbers: with the oracle as the
     world model, with ground-truth scores, with a ground-truth plan among the proposals, and with all three. The first
-    rerun that succeeds names the stage to work on:
+    rerun that succeeds tells you which stage to work on:
 
       imagination  ground-truth futures are enough: a better world model helps
-      scoring      ground-truth scores are enough: a good plan was proposed, and the agent did not choose it
-      proposals    a ground-truth plan is enough: the agent recognises a good plan, and proposed none
+      scoring      ground-truth scores are enough: a good plan was proposed, but the agent did not choose it
+      proposals    a ground-truth plan is enough: the agent recognises a good plan but proposed none
       joint        only all three together are enough
-      beyond       not even all three: the budget, the actions, or the answer
+      beyond       not even all three: look at the budget, the actions, or the answer
 
-    Question answering (aeqa) by policy explorer has other stages. Its failures, marks below 5, are rerun with the
-    oracle as the world model, with true labels and colours of real views, with a tour of the whole home before the
-    first decision, and with both of the latter:
+    Question answering (aeqa) with policy explorer has other stages. Its failures, marks below 5, are rerun with the
+    oracle as the world model, with true labels and colours for real views, with a tour of the whole home before the
+    first decision, and with the last two together:
 
       imagination  ground-truth futures are enough: a better world model helps
       perception   true labels and colours are enough: the agent went to the right places
-      exploration  a tour is enough: the agent recognises what it sees, and had not seen enough
+      exploration  a tour is enough: the agent recognises what it sees, but had not seen enough
       joint        only perception and exploration together are enough
-      answering    not even both: the map, or the answer that is read from it
+      answering    not even both: look at the map, or how the answer is read from it
 
     Ctrl-C and SIGTERM lose nothing: the same command continues, also with more episodes. Reruns are stored in
-    RUN/blame, a run for `wiw view RUN/blame`; `wiw report RUN` and `wiw view RUN` show the verdicts.
+    RUN/blame, which `wiw view RUN/blame` opens like any run; `wiw report RUN` and `wiw view RUN` show the verdicts.
 
     Args:
         run: The run's folder.
-        arm: One arm or several; all if not given.
-        episodes: Largest number of failures per arm, drawn at random; all if not given.
-        workers: Processes; as many as the run was started with if not given. Results do not depend on it.
+        arm: One arm or several. Default: all.
+        episodes: Maximum number of failures per arm, sampled at random. Default: all.
+        workers: Number of processes. Default: as many as the run was started with. Results do not depend on it.
         retry_errors: Whether to repeat reruns that ended with an infrastructure error.
-        revision_option: An option of the policy that revises in place of the run's, such as vlm=URL of another server;
-            may be given again. What would change results is refused, and so are other options where nothing is left to
-            rerun.
-        tracker: The tracker by another name, likewise.
-        tracker_option: An option of the tracker, such as weights=FOLDER where they lie now; may be given again.
+        revision_option: Override an option of the run's revision policy, such as vlm=URL for another server; may be
+            repeated. Options that would change results are refused, and so is any override if nothing is left to rerun.
+        tracker: Override the run's tracker by name, under the same conditions.
+        tracker_option: Override an option of the tracker, such as weights=FOLDER if they have moved; may be repeated.
     """
     from wiw.studies.blame import blame as rerun_failures
 
@@ -88,7 +87,7 @@ def blame(
 
 
 def _parse_revision_options(run: Path, pairs: tuple[str, ...]) -> dict[str, Any]:
-    """Return options of the policy that revises in a run.
+    """Return options for the revision policy of a run.
 
     Raises:
         ArgumentError: its arms have different ones.
@@ -104,5 +103,5 @@ def _parse_revision_options(run: Path, pairs: tuple[str, ...]) -> dict[str, Any]
         _, agents = read_recipes(store)
     revisers = {str(recipe.reviser or recipe.policy) for recipe in agents.values()}
     if len(revisers) > 1:
-        raise ArgumentError(f"--revision-option: the arms have several policies that revise: {', '.join(revisers)}")
+        raise ArgumentError(f"--revision-option: the arms have different revision policies: {', '.join(revisers)}")
     return parse_options(pairs, POLICIES.find(revisers.pop()), "--revision-option")

@@ -25,24 +25,24 @@ def check_model(
     scenes: Annotated[str, arg(metavar="SPEC")] = "apartments:val:1",
     deadline: Annotated[float, arg(metavar="SECONDS")] = 300.0,
 ) -> int:
-    """Request a few rollouts from a world model, and say in plain words what is wrong with them.
+    """Request a few rollouts from a world model and say in plain words what is wrong with them.
 
     $ wiw check-model my_model.py:MyModel
     $ wiw check-model svd --world-model-option steps=2
     $ wiw check-model remote:ws://127.0.0.1:8765
 
     Every check is listed with its result: type, dtype, shape, number of frames and NaN; frame 0; channel order, scale,
-    orientation and temporal order of the frames, compared with the agent's true views; networks left in training
-    mode; whether the model modifies its inputs or earlier answers; whether the same seeds give the
-    same frames, whether a row depends on those beside it, whether `causal` is true, whether the plan makes a
-    difference; and how long a rollout takes. Exit code 1 if the contract is broken.
+    orientation and temporal order of the frames, compared with the agent's true views; networks left in training mode;
+    whether the model modifies its inputs or earlier outputs; whether the same seeds give the same frames, whether a row
+    depends on the others in its batch, whether `causal` holds, whether the plan makes a difference; and how long a
+    rollout takes. Exit code 1 if the contract is broken.
 
     Args:
         model: Name, path.py:Class, package.module:Class, or remote:ws://HOST:PORT. See `wiw list`.
-        world_model_option: An option of the model, such as weights=FOLDER or steps=30; may be given again.
-        scenes: Source of the observations: apartments:val:1, a mesh, a Gazebo world or scans, as in `wiw run`. Those of
-            models that take poses of a gripper come from the tables of manipulation.
-        deadline: Time limit in seconds for a call of the model or its constructor, as in `wiw run`.
+        world_model_option: An option of the model, such as weights=FOLDER or steps=30; may be repeated.
+        scenes: Source of the observations: apartments:val:1, a mesh, a Gazebo world or scans, as in `wiw run`. Models
+            controlled by gripper poses are shown manipulation tables instead.
+        deadline: Time limit in seconds for a call to the model or its constructor, as in `wiw run`.
     """
     from rich.console import Console
     from rich.markup import escape

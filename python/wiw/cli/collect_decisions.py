@@ -21,24 +21,24 @@ def collect_decisions(
     size: Annotated[tuple[int, int], arg(metavar="H W")] = (576, 1024),
     seed: Annotated[int, arg(metavar="N")] = 0,
 ) -> int:
-    """Construct decisions between plans, with what each would truly lead to, to compare world models without a loop.
+    """Construct decisions between plans with known outcomes, to compare world models without running episodes.
 
     $ wiw collect decisions --scenes apartments:val:20 --out decisions.parquet
     $ wiw train ltx-action --data data --decisions decisions.parquet --out runs/ltx
 
-    A decision has an observation, a goal that is in sight of it, and plans that lead apart: turns to one of 16
-    headings, then steps ahead as far as it is free. A model scores each plan by how near the panorama that it imagines
-    at the end looks to that of the goal; the oracle scores the true one. Validation while training reports
-    how well both orders agree, and how much further from the goal the model's choice ends than the best plan.
+    A decision consists of an observation, a goal within sight, and plans that lead to different places: turn to one of
+    16 headings, then step ahead as far as the way is free. A model scores each plan by how similar the panorama it
+    imagines at the end is to the goal's; the oracle uses the true panorama. Validation during training reports how well
+    the two rankings agree, and how much further from the goal the model's choice ends than the best plan.
 
     Args:
-        scenes: Scenes, which may be of any split: apartments:val:20, a mesh, a Gazebo world or scans, as in `wiw run`.
-        out: New Parquet file: a row a plan, a row group a decision.
-        per_scene: Decisions in each scene; fewer where there is no room for more.
-        plans: Plans of each decision.
-        actions: Most actions of a plan; at most those of the clips that a model is trained on.
+        scenes: Scenes of any split: apartments:val:20, a mesh, a Gazebo world or scans, as in `wiw run`.
+        out: New Parquet file, with one row per plan and one row group per decision.
+        per_scene: Decisions per scene; fewer if there is no room for more.
+        plans: Plans per decision.
+        actions: Maximum number of actions in a plan; no more than in the clips that a model is trained on.
         size: Height and width of the panoramas in pixels.
-        seed: With scenes and options, it determines the decisions.
+        seed: Together with scenes and options, it determines the decisions.
     """
     from wiw.datasets.decisions import save_decisions
     from wiw.datasets.parquet_files import require_pyarrow

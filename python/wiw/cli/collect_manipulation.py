@@ -36,25 +36,25 @@ def collect_manipulation(
     $ wiw collect manipulation --out demos --workers 4
     $ wiw collect manipulation --tasks push_buttons,stack_cups --episodes 20 --size 128 --frames 60 --depth --out few
 
-    Scripted experts that know all object poses perform each task; only successes are kept. A row is a frame: the front
-    view, the gripper's pose and its commanded pose. `docs/demonstrations.md` names the columns, and
+    Scripted experts that know all object poses perform each task; only successes are kept. Each row is a frame: the
+    front view, the gripper's pose and its commanded pose. `docs/demonstrations.md` describes the columns, and
     `wiw.datasets.demonstrations.Demonstrations` reads them. The tables are never those of an evaluation. To resume an
     interrupted collection, repeat the command.
 
     Args:
-        out: New folder, or one that the same command began.
-        tasks: all, or push_buttons, slide_block, insert_peg, stack_cups with commas between them.
+        out: New folder, or one that the same command started.
+        tasks: all, or a comma-separated list of push_buttons, slide_block, insert_peg and stack_cups.
         episodes: Demonstrations per task.
-        seed: Seed; it determines the demonstrations.
-        size: Side of the square front view in pixels.
+        seed: Seed, which determines the demonstrations.
+        size: Height and width of the square front view in pixels.
         frames: Frames per demonstration, evenly spaced in time.
-        format: Image format: jpeg of quality 95, or lossless png.
-        depth: Whether to write the front view's depth too.
-        wrist: Whether to write what the wrist camera sees too, with --depth its depth as well.
-        keep_failed: Whether to keep failed demonstrations, too; otherwise another table replaces theirs.
-        backend: Renderer; pictures differ a little between them.
-        workers: Processes; the files are the same for any number of them.
-        place: Where they are; with engine ray, --out is a folder that all machines of the cluster see.
+        format: Image format: jpeg (quality 95) or lossless png.
+        depth: Also write the front view's depth.
+        wrist: Also write the wrist camera's view, and with --depth its depth.
+        keep_failed: Also keep failed demonstrations; otherwise their tables are replaced by others.
+        backend: Renderer; images differ slightly between renderers.
+        workers: Number of processes; the files do not depend on it.
+        place: Where the processes run; with engine ray, --out must be visible to all machines of the cluster.
     """
     from wiw.training.collect import collect
 

@@ -44,32 +44,33 @@ def collect_navigation(
     $ wiw data stats data
     $ wiw data show data --out data.png
 
-    An agent goes from one waypoint of a scene to the next, by Algorithm 1 of the World-in-World paper, with steps of
-    0.2 m and turns of 22.5 degrees. Every frame is stored with its pose and the action that led to it, in Parquet files
-    that Hugging Face's datasets opens: a row is a frame, a row group is the segment between two waypoints.
-    `docs/collecting-navigation.md` names the columns, and `wiw.datasets.navigation.NavigationData` reads them. Scenes
-    of val and test splits are refused. To resume an interrupted collection, repeat the command: a killed one loses one
-    segment at most.
+    An agent goes from one waypoint of a scene to the next, following Algorithm 1 of the World-in-World paper, with
+    steps of 0.2 m and turns of 22.5 degrees. Every frame is stored with its pose and the action that led to it, in
+    Parquet files that Hugging Face datasets can open: a row is a frame, a row group is the segment between two
+    waypoints. `docs/collecting-navigation.md` describes the columns, and `wiw.datasets.navigation.NavigationData` reads
+    them. Scenes of val and test splits are refused. To resume an interrupted collection, repeat the command: a killed
+    one loses one segment at most.
 
     Args:
-        scenes: Scenes of train splits: apartments:train[[:FIRST]:END], meshes (GLB, glTF, OBJ, PLY, DAE), Gazebo
-            worlds; several with spaces between them.
-        out: New folder, or one that the same command began.
-        preset: paper counts waypoints within 3 m as visited, default within 0.5 m, so that fewer rooms stay unseen.
-        passes: Passes over each scene, each with other waypoints and another start; more passes, more frames.
-        seed: Seed; with scenes and options, it determines the dataset.
-        size: Height and width in pixels; 576 1024 for panoramas and 480 480 for perspective views if not given.
-        perspective: Whether to record perspective front views (HFOV 90 degrees) in place of panoramas.
-        height: Metres of the camera above the floor.
+        scenes: Scenes of train splits, separated by spaces: apartments:train[[:FIRST]:END], meshes (GLB, glTF, OBJ,
+            PLY, DAE), Gazebo worlds.
+        out: New folder, or one that the same command started.
+        preset: paper counts waypoints within 3 m as visited; default counts those within 0.5 m, so that fewer rooms are
+            missed.
+        passes: Passes over each scene, each with its own start and waypoints; more passes give more frames.
+        seed: Seed; together with scenes and options, it determines the dataset.
+        size: Height and width in pixels. Default: 576 1024 for panoramas, 480 480 for perspective views.
+        perspective: Record perspective front views (HFOV 90 degrees) instead of panoramas.
+        height: Height of the camera above the floor in metres.
         depth: Whether to record depth.
-        lossless: Whether colour is stored as lossless WebP; otherwise as JPEG of quality 95.
-        rule: Another rule of the path, such as spacing=2 or next_waypoint=2m; may be given again. See
+        lossless: Store colour as lossless WebP; otherwise as JPEG (quality 95).
+        rule: A rule for the path, such as spacing=2 or next_waypoint=2m; may be repeated. See
             `wiw.training.navigation_rules.NavigationRules`.
-        backend: Renderer; pictures differ a little between them.
-        workers: Processes; the files are the same for any number of them.
-        place: Where they are; with engine ray, --out is a folder that all machines of the cluster see.
-        skip_errors: Whether to leave out scenes that cannot be opened; otherwise they are an error at the end.
-        dry_run: Whether to plan only, and to print how many frames, hours and gigabytes it would be.
+        backend: Renderer; images differ slightly between renderers.
+        workers: Number of processes; the files do not depend on it.
+        place: Where the processes run; with engine ray, --out must be visible to all machines of the cluster.
+        skip_errors: Skip scenes that cannot be opened; otherwise they are reported as an error at the end.
+        dry_run: Only plan, and print how many frames, hours and gigabytes it would take.
     """
     from wiw.runs.part_options import parse_options
     from wiw.training.collect_navigation import collect_navigation
@@ -92,7 +93,7 @@ def collect_navigation(
         f"{totals['dropped']} waypoint{'' if totals['dropped'] == 1 else 's'} could not be reached"
     )
     for scene, error in data.meta["left_out"].items():
-        print(f"left out  {scene}: {error}")
+        print(f"skipped   {scene}: {error}")
     print(f"written   {out}")
     return 0
 

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Write settings as the flags that they are read from, so that a command can be run by hand or as a job."""
+"""Write settings as command-line flags, so that a command can be run by hand or as a job."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from typing import Any
 
 
 def format_flags(settings: Any) -> list[str]:
-    """Return the flags of a dataclass of settings that differ from its defaults, as the command line takes them."""
+    """Return the command-line flags for those settings of a dataclass that differ from its defaults."""
     plain = type(settings)()
     given = {field.name: getattr(settings, field.name) for field in fields(settings)}
     return [

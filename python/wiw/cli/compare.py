@@ -26,23 +26,22 @@ def compare(
 ) -> int:
     """Compare two runs on the same episodes, the second minus the first.
 
-      $ wiw compare runs/old runs/new                          # every arm that both have
-      $ wiw compare runs/old /elsewhere/new --arm warp         # one
-      $ wiw compare runs/a runs/b --arm warp --other mine      # mine of the second run minus warp of the first
-      $ wiw compare runs/a runs/b --judge rules+llm            # by the marks that `wiw judge` added to both
+      $ wiw compare runs/old runs/new                          # every arm that both runs have
+      $ wiw compare runs/old /elsewhere/new --arm warp         # one arm
+      $ wiw compare runs/a runs/b --arm warp --other mine      # mine from the second run minus warp from the first
+      $ wiw compare runs/a runs/b --judge rules+llm            # with the marks that `wiw judge` added to both
 
     Episodes are compared in pairs, so the runs must have the same task, seed, scenes and episodes, and the same budget
-    of decisions and actions; otherwise the message names what differs. Other differences, such as the policy's
-    weights or the version of wiw, are listed below the table.
+    of decisions and actions; otherwise the error says what differs. Other differences, such as the policy's weights or
+    the version of wiw, are listed below the table.
 
     Args:
         first: Folder of a run.
-        second: Folder of the run that is compared with it.
-        arm: Arm of both runs, or of the first; all common arms if not given.
-        other: Arm of the second run, if it has another name there.
-        judge: Judge whose marks are compared, by name or digest; each run's own if not given. Unlike judges are
-            refused.
-        unlike_budgets: Compare runs whose episodes may take unlike numbers of decisions or actions nevertheless.
+        second: Folder of the run to compare with it.
+        arm: Arm of both runs, or of the first. Default: all arms they share.
+        other: Arm of the second run, if it has a different name there.
+        judge: Judge whose marks are compared, by name or digest. Default: each run's own. Different judges are refused.
+        unlike_budgets: Compare the runs even if their episodes have different budgets of decisions or actions.
     """
     from wiw.report.tables import print_summary
     from wiw.studies.compare import compare as compare_runs

@@ -24,19 +24,19 @@ def verify_data(
     *,
     quick: bool = False,
 ) -> int:
-    """Check every file and frame of a navigation dataset; with several, also that they share no scene.
+    """Check every file and frame of a navigation dataset; given several, also check that they share no scene.
 
     $ wiw data verify data
     $ wiw data verify data --quick
     $ wiw data verify train held-out
 
-    Files are compared with their SHA-256; frames with the list of segments; poses with the actions that led to them;
-    pictures are decoded, and compared with all others: equal ones of two scenes or datasets are a leak. Exit code 0 if
-    all is sound, 1 otherwise.
+    Files are checked against their SHA-256, frames against the list of segments, and poses against the actions that led
+    to them. Images are decoded and compared with all others: equal ones in two scenes or datasets are a leak. Exit code
+    0 if everything is sound, 1 otherwise.
 
     Args:
         folders: Finished datasets of `wiw collect navigation`.
-        quick: Whether to leave the pictures out, which take most of the time.
+        quick: Skip the images, which take most of the time.
     """
     from wiw.cli.bars import Bars
     from wiw.datasets.navigation_check import verify_datasets
@@ -60,7 +60,7 @@ def stats_data(folder: Folder, /, *, clip: Annotated[int, arg(metavar="N")] = 14
 
     Args:
         folder: Finished dataset of `wiw collect navigation`.
-        clip: Frames of the windows to count.
+        clip: Length in frames of the windows to count.
     """
     from wiw.datasets.navigation import NavigationData
     from wiw.datasets.navigation_statistics import compute_statistics
@@ -132,19 +132,19 @@ def show_data(
     scenes: Annotated[int, arg(metavar="N")] = 6,
     frames: Annotated[int, arg(metavar="N")] = 4,
 ) -> int:
-    """Draw maps of what a navigation dataset covers, and frames with their actions and depth.
+    """Draw maps of the floor that a navigation dataset covers, and frames with their actions and depth.
 
     $ wiw data show data --out data.png
     $ wiw data show data --scenes 12 --frames 2
 
-    On a map, floor within 1 m of a frame is green, other floor red; the path goes from blue to orange; red dots are the
+    On a map, floor within 1 m of a frame is green and other floor red; the path goes from blue to orange; red dots are
     waypoints, the circle is the start.
 
     Args:
         folder: Finished dataset of `wiw collect navigation`.
         out: Where to write the sheet, a PNG.
         scenes: Number of maps, spread evenly over the dataset.
-        frames: Frames beside each map.
+        frames: Frames next to each map.
     """
     from wiw.datasets.navigation import NavigationData
     from wiw.errors import ArgumentError
@@ -173,22 +173,21 @@ def export_data(
     fps: Annotated[int | None, arg(metavar="N")] = None,
     workers: Annotated[int, arg(metavar="N")] = 1,
 ) -> int:
-    """Write what was collected as a LeRobot dataset, format v3.0.
+    """Convert collected data to a LeRobot dataset, format v3.0.
 
     $ wiw data export data --out data-lerobot --workers 4
     $ wiw data export demos --out demos-lerobot --fps 30
 
     A segment of `wiw collect navigation` or a demonstration of `wiw collect manipulation` becomes an episode. Colour
-    and depth stay exactly as they are; LeRobot's own tools make videos of them. `docs/lerobot.md` lists the features.
-    The new folder is there once all of it is written.
+    and depth are kept exactly; LeRobot's own tools can turn them into videos. `docs/lerobot.md` lists the features. The
+    new folder appears once all of it is written.
 
     Args:
         folder: Finished collection.
         out: New folder.
-        format: Format of the new dataset; there is one.
-        fps: Frames a second that timestamps are counted in; 5 for navigation and the mean rate of demonstrations if not
-            given.
-        workers: Threads that encode pictures of navigation.
+        format: Format of the new dataset; there is only one.
+        fps: Frames per second for the timestamps. Default: 5 for navigation, and the mean rate of demonstrations.
+        workers: Threads that encode navigation images.
     """
     from wiw.cli.bars import Bars
     from wiw.datasets.lerobot import export_lerobot
@@ -206,17 +205,17 @@ def import_data(
     out: Annotated[Path, arg(metavar="DIR")],
     format: Literal["lerobot"] = "lerobot",
 ) -> int:
-    """Write the collection that a LeRobot dataset was exported from.
+    """Convert an exported LeRobot dataset back to the collection it came from.
 
     $ wiw data import data-lerobot --out data
     $ wiw data verify data
 
-    Only what `wiw data export` has written can be read: others lack poses, cameras and scenes or tables.
+    Only datasets written by `wiw data export` can be read: others lack poses, cameras, and scenes or tables.
 
     Args:
         folder: LeRobot dataset, format v3.0.
         out: New folder.
-        format: Format of the dataset; there is one.
+        format: Format of the dataset; there is only one.
     """
     from wiw.cli.bars import Bars
     from wiw.datasets.lerobot import import_lerobot

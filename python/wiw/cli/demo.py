@@ -18,14 +18,14 @@ from wiw.world_models.base import Requirements
 
 @dataclass(frozen=True)
 class Part:
-    """One task of the demo."""
+    """One task in the demo."""
 
     task: str
     policy: str
     arms: tuple[str, ...]
     episodes: int
     about: str
-    """What happens, in a sentence that goes on with the number of world models."""
+    """What happens, as the beginning of a sentence that ends with the number of world models."""
     more: str
     """A command for more of the same."""
     options: dict[str, Any] = field(default_factory=dict)
@@ -50,7 +50,7 @@ PARTS = (
         "recogniser",
         ("none", "warp", "oracle"),
         4,
-        "An agent looks at an object from other sides until it recognises it: 4 episodes in 2 generated apartments",
+        "An agent looks at an object from several sides until it recognises it: 4 episodes in 2 generated apartments",
         "wiw run ar --arms none,copy,warp,oracle --episodes 100",
         {"scenes": "apartments:val:2", "per_scene": 2},
         TORCH,
@@ -77,24 +77,24 @@ PARTS = (
 )
 
 
-READY = "A report of 100 episodes, ready to read, is docs/report-imagenav.html in the source tree."
+READY = "docs/report-imagenav.html in the source tree is a finished report of 100 episodes."
 WORKERS = 2
-"""Processes that share the arms of a part."""
+"""Processes that share the arms of a task."""
 
 
 def demo(*, out: Annotated[Path | None, arg(metavar="DIR")] = None) -> int:
-    """All four tasks, with several world models each: three in generated apartments, and a robot arm at a table.
+    """Run all four tasks, each with several world models: three in generated apartments, one with a robot arm.
 
     Image-Goal Navigation, Active Recognition, Active Embodied Question Answering, Robotic Manipulation.
 
-    Before each decision an agent imagines where its candidate plans would lead: not at all (none), into a world where
-    nothing moves (copy, the floor), into what a small network makes of its view (warpnet; needs torch), into its view
-    warped by true depth (warp), or into the true future (oracle, a reference).
+    Before each decision an agent imagines where its candidate plans would lead. The world models differ in what they
+    imagine: nothing at all (none), the present view, unchanged (copy, the floor), a view predicted by a small network
+    (warpnet; needs torch), the present view warped by true depth (warp), or the true future (oracle, a reference).
 
     $ wiw demo
 
     Args:
-        out: Folder of the runs, one a task; runs/demo-TIME if not given.
+        out: Folder for the runs, one per task. Default: runs/demo-TIME.
     """
     begin = time.perf_counter()
     folder = out or Path("runs") / f"demo-{datetime.now():%Y%m%d-%H%M%S}"
@@ -104,25 +104,25 @@ def demo(*, out: Annotated[Path | None, arg(metavar="DIR")] = None) -> int:
     _print_wrapped(f"Open these pages in a browser. {READY}")
     for part in parts:
         print(f"        {folder / part.task / 'report.html'}")
-    print("\nMore episodes say more:")
+    print("\nFor firmer numbers, run more episodes:")
     for part in parts:
         print(f"        {part.more}")
     return max(codes)
 
 
 def _can_run(part: Part) -> bool:
-    """Return whether a part's policy can run here; say what is missing otherwise."""
+    """Return whether a part's policy can run here; if not, print what is missing."""
     if missing := part.requires.missing():
         _print_left_out(f"{part.task} with policy {part.policy}", missing, part.requires.extra)
     return not missing
 
 
 def _print_left_out(what: str, missing: list[str], extra: str) -> None:
-    print(f"{what} is left out: {', '.join(missing)} not installed (pip install 'wiw[{extra}]')\n")
+    print(f"{what} is skipped: {', '.join(missing)} not installed (pip install 'wiw[{extra}]')\n")
 
 
 def _print_wrapped(text: str) -> None:
-    """Print a text on lines as wide as the terminal, broken between words."""
+    """Print a text wrapped to the width of the terminal."""
     print(textwrap.fill(text, shutil.get_terminal_size().columns - 1, break_on_hyphens=False, break_long_words=False))
 
 
@@ -142,11 +142,11 @@ def _run(part: Part, folder: Path) -> int:
     def work() -> Any:
         return evaluate(task, agent, part.episodes, out=folder, workers=WORKERS, arms=arms, live=part.episodes)
 
-    return finish(stoppable(work, folder), report=True, remark=f"This is a demonstration with few episodes. {READY}")
+    return finish(stoppable(work, folder), report=True, remark=f"A demonstration with only a few episodes. {READY}")
 
 
 def _choose_arms(names: tuple[str, ...]) -> list[str]:
-    """Return the arms that can run here; say which is left out, and why."""
+    """Return the arms that can run here; print which is skipped, and why."""
     from wiw.registry import WORLD_MODELS
 
     arms = []

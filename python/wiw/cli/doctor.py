@@ -3,7 +3,6 @@
 
 from __future__ import annotations
 
-import importlib.metadata
 import importlib.util
 import os
 import platform
@@ -20,11 +19,11 @@ class Finding:
     name: str
     detail: str
     remedy: str = ""
-    """What to do; empty where nothing is wrong."""
+    """What to do; empty if nothing is wrong."""
 
 
 def doctor() -> int:
-    """Report what this machine can do, line by line, with a remedy where something is missing.
+    """Report what this machine can do, line by line, and how to fix what is missing.
 
     $ wiw doctor
     """
@@ -58,14 +57,15 @@ def examine() -> Iterator[Finding]:
 
 def _check_software() -> Iterator[Finding]:
     import wiw
+    from wiw.runs.platform import find_version
 
     yield Finding("wiw", f"{wiw.__version__} in {Path(wiw.__file__).parent}")
     old = tuple(map(int, platform.python_version_tuple()[:2])) < (3, 10)
     yield Finding("python", platform.python_version(), "wiw needs Python 3.10 or newer" if old else "")
     names = ("numpy", "scipy", "opencv-python-headless", "gymnasium", "matplotlib", "jinja2", "rich", "tyro")
-    missing = [name for name in names if not _find_version(name)]
+    missing = [name for name in names if not find_version(name)]
     remedy = f"pip install {' '.join(missing)}" if missing else ""
-    yield Finding("packages", ", ".join(f"{name} {_find_version(name) or 'missing'}" for name in names), remedy)
+    yield Finding("packages", ", ".join(f"{name} {find_version(name) or 'missing'}" for name in names), remedy)
 
 
 def _check_processor() -> Iterator[Finding]:
@@ -78,7 +78,7 @@ def _check_processor() -> Iterator[Finding]:
     yield Finding("threads", str(threads), fewer)
     isa, native = core.active_isa(), core.native_isa()
     slow = "" if isa == native else f"WIW_ISA holds it below {native}; unset it"
-    slow = slow or ("kernels run without AVX2, several times slower" if isa == "scalar" else "")
+    slow = slow or ("kernels run without AVX2, which makes them several times slower" if isa == "scalar" else "")
     yield Finding("instructions", isa, slow)
 
 
@@ -93,7 +93,7 @@ def _check_rendering() -> Iterator[Finding]:
     from wiw._core import render
     from wiw.errors import BackendError
 
-    yield Finding("cpu renderer", "always there")
+    yield Finding("cpu renderer", "always available")
     try:
         devices = render.egl_devices()
     except BackendError as error:
@@ -106,7 +106,7 @@ def _check_rendering() -> Iterator[Finding]:
         kind = "software" if device["software"] else "hardware"
         what = device["error"] or f"{device['renderer']}, OpenGL {device['version']} ({kind})"
         yield Finding(
-            f"egl device {device['index']}", what, "this device gives no OpenGL context" if device["error"] else ""
+            f"egl device {device['index']}", what, "this device provides no OpenGL context" if device["error"] else ""
         )
     if not usable:
         yield Finding(
@@ -116,21 +116,23 @@ def _check_rendering() -> Iterator[Finding]:
 
 def _check_torch() -> Finding:
     """Return whether torch is installed, without importing it, which takes seconds."""
+    from wiw.runs.platform import find_version
+
     if importlib.util.find_spec("torch") is None:
         return Finding("torch", "not installed; only learned world models need it (pip install 'wiw[torch]')")
-    return Finding("torch", _find_version("torch") or "of unknown version")
+    return Finding("torch", find_version("torch") or "of unknown version")
 
 
 def _check_writable(name: str, folder: Path) -> Finding:
     gigabytes = _count_free_gigabytes(folder)
     detail = f"{folder}, {gigabytes:.0f} GB free"
     if not os.access(folder, os.W_OK):
-        return Finding(name, detail, "not writable: go to another folder or give --out")
+        return Finding(name, detail, "not writable: change to another folder or give --out")
     return Finding(name, detail, "nearly full: a run with pictures may need 1 GB" if gigabytes < 1 else "")
 
 
 def _cache() -> Finding:
-    """Return the folder of imported and generated scenes: where it is, what it holds, whether it can grow."""
+    """Describe the cache of imported and generated scenes: where it is, what it holds, whether it can grow."""
     from wiw.scenes.store import folder, limit
 
     cache = folder()
@@ -148,10 +150,3 @@ def _cache() -> Finding:
 def _count_free_gigabytes(folder: Path) -> float:
     disk = os.statvfs(folder)
     return disk.f_bavail * disk.f_frsize / 2**30
-
-
-def _find_version(package: str) -> str | None:
-    try:
-        return importlib.metadata.version(package)
-    except importlib.metadata.PackageNotFoundError:
-        return None

@@ -28,7 +28,7 @@ def episodes(
     sheet: Annotated[Path | None, arg(metavar="PNG")] = None,
     overwrite: bool = False,
 ) -> int:
-    """Generate the episodes of a task and write them to a file, which `wiw run --episode-file` takes.
+    """Generate the episodes of a task and write them to a file for `wiw run --episode-file`.
 
     $ wiw episodes imagenav --scenes apartments:val:20 --episodes 100 --out val.json.gz
     $ wiw episodes imagenav --scenes house.glb --per-scene 10 --episodes 10 --out house.json
@@ -38,26 +38,28 @@ def episodes(
     $ wiw episodes ar --task-option categories=bed,sofa,desk --out three.json
     $ wiw episodes ar --preset foresight --scenes apartments:val:12 --episodes 60 --out hard.json.gz
 
-    Scenes inside the file's folder are named by relative paths, so that the folder can be moved or shared.
+    Scenes inside the file's folder are stored as relative paths, so that the folder can be moved or shared.
 
     Args:
         task: See `wiw list`.
-        out: JSON; gzipped if the name ends in .gz.
-        preset: Whose rules the episodes satisfy, such as foresight of ar; default if not given. See `wiw list presets`.
+        out: JSON file; gzipped if the name ends in .gz.
+        preset: Preset whose rules the episodes satisfy, such as foresight for ar. Default: default. See `wiw list
+            presets`.
         scenes: apartments:train|val|test[[:FIRST]:END], a mesh (GLB, glTF, OBJ, PLY, DAE), a Gazebo world, or scans
-            (hm3d:DIR:val, mp3d:DIR, replica:DIR, hssd:DIR, replicacad:DIR, procthor:DIR); apartments:val if not given.
+            (hm3d:DIR:val, mp3d:DIR, replica:DIR, hssd:DIR, replicacad:DIR, procthor:DIR). Default: apartments:val.
         episodes: Number of episodes.
-        per_scene: Episodes per scene; the task's own number if not given.
-        tier: For imagenav: goals 2 to 5 m away, 5 to 8 m away, or one corner beyond what the start sees, where the way
-            forks; all: the three in turn.
-        seed: Seed; with the scenes, it determines the episodes.
-        backend: Renderer, for checking that goals are out of sight; auto if not given.
-        attributes: For aeqa and a scene from a file: JSON of what more is known of its instances, by their names, such
-            as {"Desk_01": {"color": "brown", "state": "open"}}.
+        per_scene: Episodes per scene. Default: the task's.
+        tier: For imagenav: goals 2 to 5 m away (near), 5 to 8 m away (far), or one corner beyond what is visible from
+            the start, where the way forks (beyond); all: the three in turn.
+        seed: Seed; together with the scenes, it determines the episodes.
+        backend: Renderer used to check that goals are out of sight. Default: auto.
+        attributes: For aeqa and a scene from a file: JSON with attributes of its instances, by their names, such as
+            {"Desk_01": {"color": "brown", "state": "open"}}.
         task_option: Another option of the task, such as categories=bed,sofa or, for scans, goal_instances=1; may be
-            given again.
-        sheet: For imagenav: where to draw up to 12 of the episodes: scene from above with the floor that the start sees
-            (yellow), the ways on and the shortest path, then the start's panorama and the goal's view.
+            repeated.
+        sheet: For imagenav: PNG file in which to draw up to 12 episodes. Each shows the scene from above, with the
+            floor visible from the start (yellow), the possible ways on and the shortest path, then the start's panorama
+            and the goal image.
         overwrite: Whether to replace an existing file.
     """
     from wiw.datasets.episodes import save
@@ -65,15 +67,15 @@ def episodes(
     from wiw.registry import TASKS
 
     if out.exists() and not overwrite:
-        raise ArgumentError(f"{out} is there already; give --overwrite to replace it, or another name with --out")
+        raise ArgumentError(f"{out} already exists; give --overwrite to replace it, or choose another name with --out")
     more = {} if attributes is None else {"attributes": str(attributes)}
     rules = {"preset": preset, "tier": tier, "per_scene": per_scene, **more}
     flags = {"scenes": scenes, "seed": seed, "backend": backend, **rules}
     made = TASKS.make(task, **task_options(task, task_option, flags))
     if made.file_header is None:
         raise ArgumentError(
-            f"episodes: task '{task}' reads no episode file; its episodes are a function of the seed, so "
-            f"`wiw run {task} --seed {seed} --episodes {episodes}` has the same ones anywhere"
+            f"episodes: task '{task}' does not read episode files; its episodes are determined by the seed, so `wiw "
+            f"run {task} --seed {seed} --episodes {episodes}` runs the same ones anywhere"
         )
     found = made.episodes(episodes)
     try:

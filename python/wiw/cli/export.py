@@ -27,15 +27,15 @@ def export(
     $ wiw export runs/first --csv tables
     $ wiw export runs/first --parquet tables --rerun first.rrd
 
-    Tables: arms, episodes, outcomes, decisions and candidates; where a task has them, kinds, anytime,
-    anytime_differences, twins, and judgements (of all judges). A stopped export leaves no half file.
+    Tables: arms, episodes, outcomes, decisions and candidates; for tasks that have them also kinds, anytime,
+    anytime_differences, twins and judgements (by all judges). An interrupted export leaves no partial file.
 
     Args:
         run: The run's folder.
         csv: New folder for CSV files.
-        parquet: New folder for Parquet files; needs pyarrow.
-        rerun: Recording for `rerun FILE.rrd`, with the pictures that the run kept; needs rerun-sdk.
-        judge: Judge whose marks are exported, by name or digest (see `wiw judge`); the run's own if not given.
+        parquet: New folder for Parquet files; requires pyarrow.
+        rerun: Recording for `rerun FILE.rrd`, with the images that the run kept; requires rerun-sdk.
+        judge: Judge whose marks are exported, by name or digest (see `wiw judge`). Default: the run's own.
     """
     from wiw.studies.run_log import load_run
 

@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The help of flags, one paragraph each.
+"""Build the help of flags, one paragraph each.
 
 tyro takes the description of a flag from a docstring, and keeps every line break there. To flags that a dataclass
-declares it also adds "(default: None)" where their description says what holds if they are not given.
+declares it also adds "(default: None)", even if their description already says what the default is.
 """
 
 from __future__ import annotations
@@ -25,7 +25,7 @@ def join_lines(command: Callable[..., int]) -> Callable[..., int]:
 
 
 def read_flags(info: StructTypeInfo) -> StructConstructorSpec | None:
-    """Return how a dataclass of wiw is read from flags, None for other types: a rule for a `ConstructorRegistry`."""
+    """Return how to read a dataclass of wiw from flags, None for other types: a rule for a `ConstructorRegistry`."""
     is_ours = dataclasses.is_dataclass(info.type) and info.type.__module__.split(".")[0] == "wiw"
     if not is_ours or not isinstance(info.default, info.type):
         return None
@@ -58,5 +58,5 @@ def _read_descriptions(kind: type) -> dict[str, str]:
 
 
 def _hide_none(annotation: Any, default: Any) -> Any:
-    """Return the type of a field, marked not to show a default of None."""
+    """Return the type of a field, annotated so that a default of None is not shown."""
     return Annotated[annotation, arg(help_behavior_hint="")] if default is None else annotation

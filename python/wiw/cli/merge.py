@@ -16,20 +16,20 @@ def merge(
     out: Annotated[Path, arg(metavar="RUN")],
     scratch: Annotated[Path | None, arg(metavar="DIR")] = None,
 ) -> int:
-    """Merge the stores of a run's shards into one run, equal to what one process would have recorded.
+    """Merge the stores of a run's shards into one run, identical to what a single process would have recorded.
 
     $ wiw merge runs/a/1 runs/a/2 --out runs/whole
     $ wiw merge runs/a --out runs/whole
     $ wiw report runs/whole
 
-    Stores of unlike runs are refused, with the first difference. An episode that several stores have is taken from the
-    first that has ended it; records that differ are refused where equal ones are promised, and counted elsewhere.
-    Episodes that no store has are named, and `wiw resume` runs them. docs/many-machines.md has the whole.
+    Stores of different runs are refused, naming the first difference. An episode found in several stores is taken from
+    the first that has finished it; differing records are refused if equal ones are guaranteed, and counted otherwise.
+    Episodes that no store has are listed, and `wiw resume` runs them. See docs/many-machines.md.
 
     Args:
-        stores: Folders of runs with --shard, or folders that hold these.
-        out: Folder of the merged run; any disk will do.
-        scratch: Folder on a local disk in which it is written first; the system's for temporary files if not given.
+        stores: Folders of runs with --shard, or folders that contain them.
+        out: Folder of the merged run, on any disk.
+        scratch: Folder on a local disk in which it is written first. Default: the system's temporary folder.
     """
     from wiw.runs.merge import merge as merge_stores
 

@@ -27,18 +27,18 @@ What = Literal[
 
 
 def list_names(what: Positional[What] = "all", /) -> int:
-    """List everything with a name: world models, policies, tasks, presets, studies, metrics, VLMs, prompts and so on.
+    """List everything that has a name: world models, policies, tasks, presets, studies, metrics, VLMs and prompts.
 
     $ wiw list
     $ wiw list world-models
     $ wiw list presets
 
-    Built-in names come first, then those of installed packages. A package adds its own by entry points in the group
-    that is shown beside a heading.
+    Built-in names come first, then those of installed packages. A package adds its own with entry points in the group
+    shown next to each heading.
 
     Args:
-        what: Kind of names; world-models also shows each model's inputs, its weights, and what is missing on this
-            machine, presets what each sets and where it departs from the paper.
+        what: Kind of names to list. world-models also shows each model's inputs and weights, and what is missing on
+            this machine; presets shows what each preset sets and where it departs from the paper.
     """
     from rich.console import Console
 
@@ -114,9 +114,9 @@ def _add_presets(table: Any, detailed: bool = False) -> None:
 
 
 def _add_errors(table: Any) -> None:
-    from wiw.experiments.errors import ERRORS
+    from wiw.experiments.errors.kinds import ERRORS
 
-    table.add_row("[bold]Errors of futures[/]", "[dim]--arms error-KIND@DOSE[:MODEL]; of the oracle without MODEL[/]")
+    table.add_row("[bold]Errors of futures[/]", "[dim]--arms error-KIND@DOSE[:MODEL]; by default of the oracle[/]")
     for name, kind in ERRORS.items():
         table.add_row(f"  {name}", f"{escape(kind.about)} [dim]Dose: {escape(kind.unit)}.[/]")
     table.add_row()
@@ -125,7 +125,7 @@ def _add_errors(table: Any) -> None:
 def _add_tiers(table: Any) -> None:
     from wiw.datasets.imagenav import TIERS
 
-    table.add_row("[bold]Tiers of imagenav[/]", "[dim]--tier NAME, or all of them in turn: --tier all[/]")
+    table.add_row("[bold]Tiers of imagenav[/]", "[dim]--tier NAME, or --tier all for all of them in turn[/]")
     for name, tier in TIERS.items():
         table.add_row(f"  {name}", tier.about)
     table.add_row()
@@ -145,17 +145,17 @@ def _add_studies(table: Any) -> None:
 def _add_vlm_models(table: Any) -> None:
     from wiw.policies.vlm import presets as vlms
 
-    table.add_row("[bold]Models for policy vlm[/]", "[dim]--vlm-model NAME; docs/vlm.md says how to serve them[/]")
+    table.add_row("[bold]Models for policy vlm[/]", "[dim]--vlm-model NAME; docs/vlm.md explains how to serve them[/]")
     for name in vlms.list_names():
         table.add_row(f"  {name}", escape(vlms.describe(name)))
     table.add_row()
 
 
 def _add_prompts(table: Any) -> None:
-    from wiw.policies.vlm.prompts import SETS, Prompts
+    from wiw.policies.vlm.prompts.templates import SETS, Prompts
 
     table.add_row(
-        "[bold]Prompts of policy vlm[/]", "[dim]--prompts NAME, or a folder that `wiw prompts import` writes[/]"
+        "[bold]Prompts of policy vlm[/]", "[dim]--prompts NAME, or a folder written by `wiw prompts import`[/]"
     )
     for name, (_, line) in SETS.items():
         table.add_row(f"  {name}", f"{escape(line)} [dim](digest {Prompts(name).digest})[/]")

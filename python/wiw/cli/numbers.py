@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Parse numbers on the command line, with plain messages for anything that is not a number."""
+"""Parse numbers on the command line, with a plain message for anything that is not a number."""
 
 from __future__ import annotations
 
@@ -42,10 +42,10 @@ def _read_number(info: PrimitiveTypeInfo) -> PrimitiveConstructorSpec[Any] | Non
 
 
 def parse_numbers(text: str | None, kind: type[int | float], name: str) -> list[Any] | None:
-    """Return the numbers of an option such as "1,2,4"; None where it is not given.
+    """Return the numbers of an option such as "1,2,4"; None if it is not given.
 
     Raises:
-        ArgumentError: something in it is no number.
+        ArgumentError: something in it is not a number.
     """
     from wiw.errors import ArgumentError
 

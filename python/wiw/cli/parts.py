@@ -27,33 +27,33 @@ class TaskFlags:
     """A task's episodes and rules."""
 
     tasks: Annotated[str | None, arg(metavar="all|A,B,...")] = None
-    """For manipulation: which of its tasks, taken in turn; all of them if not given."""
+    """For manipulation: which of its tasks to run, taken in turn. Default: all."""
     scenes: Annotated[str | None, arg(metavar="SPEC")] = None
     """apartments:train|val|test[[:FIRST]:END], a mesh (GLB, glTF, OBJ, PLY, DAE), a Gazebo world, or scans
-    (hm3d:DIR:val, mp3d:DIR, replica:DIR, hssd:DIR, replicacad:DIR, procthor:DIR); apartments:val if not given."""
+    (hm3d:DIR:val, mp3d:DIR, replica:DIR, hssd:DIR, replicacad:DIR, procthor:DIR). Default: apartments:val."""
     per_scene: Annotated[int | None, arg(metavar="N")] = None
-    """Episodes generated in a scene before the next one's turn; the task's own number if not given."""
+    """Episodes generated in a scene before moving on to the next. Default: the task's."""
     tier: Literal["near", "far", "beyond", "all"] | None = None
-    """For imagenav: goals 2 to 5 m away, 5 to 8 m away, or one corner beyond what the start sees, where the way forks;
-    all: the three in turn, each with tables of its own."""
+    """For imagenav: goals 2 to 5 m away (near), 5 to 8 m away (far), or one corner beyond what is visible from the
+    start, where the way forks (beyond); all: the three in turn, each with its own tables."""
     episode_file: Annotated[Path | None, arg(metavar="FILE")] = None
-    """Episodes to run instead of generated ones, from `wiw episodes`, habitat-lab or World-in-World."""
+    """File of episodes to run instead of generated ones, from `wiw episodes`, habitat-lab or World-in-World."""
     scene_folder: Folder = None
-    """Folder of the scene paths in that file; for files of wiw the file's own folder if not given."""
+    """Folder that the scene paths in that file are relative to. Default for files of wiw: the file's own folder."""
     motion: Literal["refuse", "slide"] | None = None
-    """Rule for blocked moves; the preset's if not given."""
+    """What happens to blocked moves. Default: the preset's rule."""
     robot: Annotated[Path | None, arg(metavar="URDF")] = None
-    """For manipulation: description of an arm to work with; the Franka Panda, of simple shapes, if not given."""
+    """For manipulation: description of the robot arm. Default: the Franka Panda, in simple shapes."""
     preset: Annotated[str | None, arg(metavar="NAME|FILE")] = None
-    """All that a number depends on: default, paper, official (its published code), foresight (of ar and imagenav), or
-    a YAML file of your own; what the command line says goes before it. See `wiw list presets`."""
+    """All settings that scores depend on: default, paper, official (the paper's published code), foresight (for ar and
+    imagenav), or your own YAML file. The command line takes precedence. See `wiw list presets`."""
     task_option: Options = ()
     """A rule of the preset, such as decisions=10, or another option of the task, such as categories=bed,sofa; may be
-    given again."""
+    repeated."""
     backend: Literal["auto", "cpu", "gpu"] | None = None
-    """Renderer; auto if not given."""
+    """Renderer. Default: auto."""
     allow_missing_textures: bool = False
-    """Run on scans even where more than 5 % of the surface lacks its texture and is drawn grey."""
+    """Run on scans even if more than 5 % of the surface lacks its texture and is drawn grey."""
 
     def make_recipe(self, task: str, seed: int) -> TaskRecipe:
         """Return the recipe of a task.
@@ -73,47 +73,47 @@ class TaskFlags:
 
 @dataclass(frozen=True, kw_only=True)
 class AgentFlags:
-    """An agent's parts and what they are made with."""
+    """An agent's parts and their options."""
 
     world_model: Name = "none"
     """Name, path.py:Class or package.module:Class. See `wiw list`."""
     world_model_option: Options = ()
-    """An option of --world-model, such as weights=FOLDER or steps=30; may be given again. isolate=false runs a model of
-    your own in the process of the run."""
+    """An option of --world-model, such as weights=FOLDER or steps=30; may be repeated. isolate=false runs your own
+    model in the run's process."""
     policy: MaybeName = None
-    """Proposes plans; name, path.py:Class, or isolated:path.py:Class for a process of its own. If not given, the
-    task's: matcher, for ar recogniser, for manipulation scripted."""
+    """Policy that proposes plans: name, path.py:Class, or isolated:path.py:Class to run it in a separate process.
+    Default: the task's (matcher; for ar recogniser, for manipulation scripted)."""
     policy_option: Options = ()
-    """An option of --policy, such as weights=FILE; may be given again. Privileged counterparts in --arms take it
-    too."""
+    """An option of --policy, such as weights=FILE; may be repeated. It also applies to privileged counterparts in
+    --arms."""
     revision: MaybeName = None
-    """Scores imagined futures; the policy's own choice if not given."""
+    """Policy that scores imagined futures. Default: the policy's own choice."""
     revision_option: Options = ()
-    """An option of --revision; may be given again."""
+    """An option of --revision; may be repeated."""
     tracker: MaybeName = None
-    """For ar: finds the target in imagined frames, such as sam2 or reprojection. See `wiw list trackers`. If not given,
-    for policy vlm frames, for recogniser reprojection."""
+    """For ar: tracker that finds the target in imagined frames, such as sam2 or reprojection. See `wiw list trackers`.
+    Default: frames for policy vlm, reprojection for recogniser."""
     tracker_option: Options = ()
-    """An option of --tracker, such as weights=FOLDER of sam2; may be given again."""
+    """An option of --tracker, such as weights=FOLDER for sam2; may be repeated."""
     vlm: Annotated[str | None, arg(metavar="URL")] = None
-    """For policy vlm: an OpenAI-compatible server, transformers:PATH, replay:RUN, or mock; http://localhost:8000/v1 if
-    not given."""
+    """For policy vlm: an OpenAI-compatible server, transformers:PATH, replay:RUN, or mock. Default:
+    http://localhost:8000/v1."""
     vlm_model: MaybeName = None
-    """Its name at the server, or a preset of `wiw list`; not needed where the server has one model."""
+    """The model's name on the server, or a preset from `wiw list`; not needed if the server has only one model."""
     vlm_prices: Annotated[Path | None, arg(metavar="FILE")] = None
-    """YAML file of `model: [read, written]`, dollars per million tokens, for the costs."""
+    """YAML file of prices as `model: [read, written]`, dollars per million tokens, for the cost tables."""
     prompts: Annotated[str | None, arg(metavar="NAME|DIR")] = None
-    """For policy vlm: a set of prompts, default or minimal, or a folder of your own, such as `wiw prompts import`
-    writes."""
+    """For policy vlm: a set of prompts, default or minimal, or your own folder, such as one written by `wiw prompts
+    import`."""
     semantics: MaybeName = None
-    """Tells world models that need it what each pixel is: simulator, rednet, or path.py:Class."""
+    """Source of semantic labels for world models that need them: simulator, rednet, or path.py:Class."""
     semantics_option: Options = ()
-    """An option of --semantics, such as weights=FILE; may be given again."""
+    """An option of --semantics, such as weights=FILE; may be repeated."""
 
     def make_recipe(
         self, task: str, preset: str | None, search: PlanConfig, policies: Sequence[str] = ()
     ) -> AgentRecipe:
-        """Return the recipe of an agent for a task and its preset; `policies` are further ones that arms name.
+        """Return the recipe of an agent for a task and its preset; `policies` are others that arms name.
 
         Raises:
             ArgumentError: options without the part that takes them; a width without depth.
@@ -122,7 +122,7 @@ class AgentFlags:
 
         if search.width is not None and search.depth == 1:
             raise ArgumentError(
-                "--width: a search of one level extends no plan; give --depth 2 or more, or leave it out"
+                "--width: a search with one level does not extend plans; give --depth 2 or more, or leave --width out"
             )
         policy, reviser = (
             absolute(self.policy or TaskRecipe(task, {"preset": preset}).find_policy()),
@@ -141,7 +141,7 @@ class AgentFlags:
         )  # fmt: skip
 
     def _vlm_options(self, policies: Sequence[str]) -> dict[str, Any]:
-        """Return options of policy vlm; its own address, so that the record says where it asked."""
+        """Return the options of policy vlm, with its address, so that the record says which server it used."""
         flags = {"vlm": self.vlm, "model": self.vlm_model, "prices": self.vlm_prices, "prompts": self.prompts}
         options = {name: _make_absolute(name, value) for name, value in flags.items() if value is not None}
         if "vlm" not in policies:
@@ -155,8 +155,8 @@ class AgentFlags:
 
 
 def _make_absolute(name: str, value: Any) -> str:
-    """Return an option of policy vlm, with its path, if it is one, made absolute."""
-    from wiw.policies.vlm.prompts import SETS
+    """Return an option of policy vlm, made absolute if it is a path."""
+    from wiw.policies.vlm.prompts.templates import SETS
 
     is_path = isinstance(value, Path) or (name == "prompts" and value not in SETS)
     return str(Path(value).expanduser().resolve()) if is_path else str(value)

@@ -41,31 +41,33 @@ def power(
 
       $ wiw power                        # for differences from 5 to 30 points
       $ wiw power 10                     # +10 points, e.g. from 20 to 30 %
-      $ wiw power 10 --arms 4            # as one of four arms compared with the same base
+      $ wiw power 10 --arms 4            # the same, for one of four arms compared with one base
       $ wiw power -5 --base 50         # an arm that is 5 points worse
-      $ wiw power --scenes 40            # the least difference that 40 scenes of 5 episodes can show
-      $ wiw power 5 --task all           # two models 5 points apart, on each task as it was measured
-      $ wiw power 5 --pilot runs/first --pilot-arms mine,warp  # as two arms of a run of your own differ
+      $ wiw power --scenes 40            # the smallest difference that 40 scenes of 5 episodes can show
+      $ wiw power 5 --task all           # two models 5 points apart, with what was measured on each task
+      $ wiw power 5 --pilot runs/first --pilot-arms mine,warp  # with what two arms of your own run show
 
-    Arms are compared on the same episodes, so only episodes count in which one succeeds and the other fails: won or
-    lost. 30 % won and 20 % lost give the same difference as 12 % won and 2 % lost, but far weaker evidence, so --losses
-    matters as much as the difference. Scenes count more than episodes: with a correlation above 0, more episodes of
-    the same scenes soon stop helping.
+    Arms are compared on the same episodes, so only those episodes count in which one succeeds and the other fails: won
+    or lost. 30 % won and 20 % lost give the same difference as 12 % won and 2 % lost, but far weaker evidence, so
+    --losses matters as much as the difference. Scenes matter more than episodes: with a correlation above 0, more
+    episodes in the same scenes soon stop helping.
 
-    Without --task or --pilot, numbers are near what 210 episodes in 42 generated apartments gave: 18 % without a world
-    model; with the oracle 36 % won and 2 % lost; differences correlate within an apartment by -0.06 to 0.06.
+    Without --task or --pilot, the numbers are close to those measured on 210 episodes in 42 generated apartments: 18 %
+    without a world model; 36 % won and 2 % lost with the oracle; correlations of -0.06 to 0.06 between differences
+    within an apartment.
 
     Args:
-        difference: Percentage points of success rate; a table of usual values if neither it nor --scenes is given.
-        scenes: Number of scenes; computes the smallest difference that they can show.
-        task: Take what is not given below from two arms of this task in docs/results.md; all: one line per task.
-        pilot: Take it from two arms of this run.
-        pilot_arms: Which arms of --pilot; the second is the base.
-        base: Success rate of the arm compared with, percent; 20 if nothing says otherwise.
-        losses: Percent of episodes that the better of the two arms loses; 2 if nothing says otherwise.
-        correlation: Correlation between the differences of two episodes of a scene; 0.05 if nothing says otherwise.
-        per_scene: Episodes in each scene; 5 if nothing says otherwise.
-        chance: Power: the probability of showing the difference if there is one.
+        difference: Difference in success rate, in percentage points. If neither it nor --scenes is given, prints a
+            table of typical values.
+        scenes: Number of scenes, for computing the smallest difference that they can show.
+        task: Take values not given below from two arms of this task in docs/results.md; all: one line per task.
+        pilot: Take values not given below from two arms of this run.
+        pilot_arms: The two arms of --pilot, as ARM,BASE.
+        base: Success rate of the base arm in percent. Default: 20, unless --task or --pilot sets it.
+        losses: Percent of episodes that the better of the two arms loses. Default: 2, likewise.
+        correlation: Correlation between the differences in two episodes of a scene. Default: 0.05, likewise.
+        per_scene: Episodes in each scene. Default: 5, likewise.
+        chance: Power: the probability of showing a difference that exists.
         arms: Number of arms compared with the same base; their p values are Holm-adjusted.
     """
     from wiw.analysis.power import power as plan
@@ -95,10 +97,10 @@ def power(
 
 
 def _find_pilots(task: str | None, run: Path | None, arms: str | None) -> dict[str, Pilot]:
-    """Return pilots by task: none, one, or one for each task.
+    """Return pilots by task: none, one, or one per task.
 
     Raises:
-        ArgumentError: options that do not go together, or a pilot that is not there.
+        ArgumentError: options that do not go together, or a pilot that does not exist.
         StoreError: a run that cannot be read.
     """
     from wiw.analysis.pilot import PILOTS, find_pilot, read_pilot

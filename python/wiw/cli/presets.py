@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The settings of a preset, and where it departs from the paper, as lines of text."""
+"""Describe the settings of a preset, and where it departs from the paper, as lines of text."""
 
 from __future__ import annotations
 
@@ -11,8 +11,8 @@ from wiw.tasks.presets import DEFAULT, Preset, load_preset
 
 
 def list_settings(task: str, preset: str | Path) -> list[str]:
-    """Return what a preset sets otherwise than the default: a line for the policy that it names, for rules, for
-    generated episodes, and one for the options of each policy and model.
+    """Return where a preset differs from the default: one line each for its policy, its rules and its generated
+    episodes, and one for the options of each policy and model.
     """
     ours, base = load_preset(task, preset), load_preset(task, DEFAULT)
     named = [f"policy: {ours.policy}"] if ours.policy != base.policy else []
@@ -34,7 +34,7 @@ def list_settings(task: str, preset: str | Path) -> list[str]:
 
 
 def list_reasons(task: str, preset: str | Path) -> Iterator[str]:
-    """Yield where a preset departs from the paper, a line each, with whom that concerns and the reason."""
+    """Yield one line per departure of a preset from the paper, with whom it concerns and the reason."""
     ours, paper = load_preset(task, preset), load_preset(task, "paper")
     for who, reasons in ours.departures.items():
         for topic, reason in reasons.items():
@@ -42,7 +42,7 @@ def list_reasons(task: str, preset: str | Path) -> Iterator[str]:
 
 
 def _show_values(ours: Preset, paper: Preset, who: str, topic: str) -> str:
-    """Return the values of a setting, where a departure is about one."""
+    """Return the values of the setting that a departure is about, if it is about one."""
     values = [each.rules if who == "rules" else each.policies.get(who, {}) for each in (ours, paper)]
     if topic not in values[0]:
         return ""

@@ -21,15 +21,15 @@ def import_prompts(
     $ wiw prompts import world-in-world --out prompts/published
     $ wiw run ar --policy vlm --world-model warp --prompts prompts/paper
 
-    Slots are mapped to this project's, and each prompt is checked to render. Where the source has no prompt for a
-    question, and for the form of answers, it is completed from the set `minimal` (`wiw list prompts`). prompts.yaml in
-    the folder says where each template came from; runs record the digest of all of them.
+    Slots are mapped to those of wiw, and each prompt is test-rendered. The output format, and questions for which the
+    source has no prompt, come from the set `minimal` (`wiw list prompts`). prompts.yaml in the folder says where each
+    template came from; runs record the digest of all of them.
 
     Args:
-        source: The paper's LaTeX source, a file or a folder, or a checkout of its published code.
-        out: The folder to write; new or empty.
+        source: The paper's LaTeX source (a file or a folder), or a checkout of its published code.
+        out: Folder to write, new or empty.
     """
-    from wiw.policies.vlm.prompt_import import import_prompts
+    from wiw.policies.vlm.prompt_import.importer import import_prompts
 
     done = import_prompts(source, out)
     for name, place in done.imported.items():

@@ -24,39 +24,40 @@ def quality(
     workers: Annotated[int, arg(metavar="N")] = 1,
     place: Annotated[Engine, arg(name="")] = HERE,
 ) -> int:
-    """Does looking better help more? Visual quality and controllability of imagined frames, against success.
+    """Do better-looking frames help more? Compare success with visual quality and controllability of imagined frames.
 
     $ wiw run imagenav --arms copy,warp,warpnet,oracle --keep-images all --out runs/four
     $ wiw quality runs/four                                    # sharpness, colourfulness, SSIM to the true frames
     $ wiw quality runs/four --lpips auto                       # controllability as in the paper: 1 - LPIPS
-    $ wiw quality runs/four --scorer "python my_scorer.py"     # any scorer, in a process of its own
-    $ wiw quality runs/four runs/more --arms four/warp,svd     # arms of several runs on the same episodes
+    $ wiw quality runs/four --scorer "python my_scorer.py"     # any scorer, run in a separate process
+    $ wiw quality runs/four runs/more --arms four/warp,svd     # arms from several runs on the same episodes
 
-    Quality is what a frame looks like by itself; controllability is how near it is to what would really have been seen,
-    known of runs with --fidelity or with an arm oracle. Frames are scored as the run keeps them (what the reviser saw,
-    160 pixels high), the same places and plans of every arm, so pictures must be kept (`wiw run --keep-images`). Writes
-    quality.html, .svg, .png and .json: a table, rank correlations over the arms, and the paper's two figures.
+    Quality is how good a frame looks on its own; controllability is how close it is to what would really have been
+    seen, which is known for runs with --fidelity or with an oracle arm. Frames are scored as the run keeps them (what
+    the reviser saw, 160 pixels high), at the same places and for the same plans in every arm, so the run must keep
+    images (`wiw run --keep-images`). Writes quality.html, .svg, .png and .json: a table, rank correlations over the
+    arms, and the paper's two figures.
 
-    A scorer is any command. It is started once. Its first line on the standard output says who it is; then it reads
-    paths of PNG files, one a line, from the standard input, and answers each by a line, in any order:
+    A scorer is any command. It is started once. Its first line on standard output identifies it; then it reads paths of
+    PNG files from standard input, one per line, and answers each with one line, in any order:
 
     {"scorer": "my-musiq", "version": "1.0", "licence": "MIT", "scores": {"musiq": [0, 100]}}
     {"path": "/tmp/wiw-quality-x/5f3a.png", "scores": {"musiq": 61.5}}
 
-    Flush each line, print anything else to the standard error, end with exit code 0. Where "aesthetic" [1, 10] and
-    "musiq" [0, 100] are both given, the paper's q = (10 aesthetic + MUSIQ) / 2 is computed as well. Scores are stored
-    beside the run, in quality.sqlite: after Ctrl-C the same command scores what is missing. docs/quality.md has more.
+    Flush each line, print anything else to standard error, exit with code 0. If "aesthetic" [1, 10] and "musiq" [0,
+    100] are both given, the paper's q = (10 aesthetic + MUSIQ) / 2 is computed as well. Scores are stored next to the
+    run, in quality.sqlite: after Ctrl-C the same command scores what is missing. See docs/quality.md.
 
     Args:
-        runs: Folders of runs: one, or several of the same task, seed and episodes.
-        scorer: A command, or laion or laion:FOLDER (LAION's aesthetic predictor, with your own copy of its weights).
-            May be given several times. Sharpness and colourfulness are always there.
-        frames: To score of each arm.
-        arms: To compare; all that imagine if not given. RUN/ARM where several runs have an arm of that name.
-        lpips: Weights of LPIPS (see `wiw run --lpips`); SSIM alone if not given.
-        out: Where to write; quality in the first run's folder if not given.
+        runs: Folders of runs: one, or several with the same task, seed and episodes.
+        scorer: A command, or laion or laion:FOLDER (LAION's aesthetic predictor, with your own copy of its weights);
+            may be repeated. Sharpness and colourfulness are always computed.
+        frames: Number of frames to score in each arm.
+        arms: Arms to compare; RUN/ARM if several runs have an arm of that name. Default: all with a world model.
+        lpips: Weights of LPIPS (see `wiw run --lpips`). Default: none, SSIM only.
+        out: Folder to write. Default: quality in the first run's folder.
         deadline: Seconds that a scorer may be silent.
-        workers: Actors of Ray that score frames, each with scorers of its own.
+        workers: Ray actors that score frames, each with its own scorers.
         place: Where frames are scored.
     """
     from wiw.cli.bars import Bars

@@ -26,15 +26,15 @@ def report(
     $ wiw report runs/first --out first.html --max-mb 1
     $ wiw report runs/first --judge rules+llm
 
-    Also works during the run.
+    Also works while the run is still going.
 
     Args:
         run: The run's folder.
-        out: Where to write; report.html in the run's folder if not given.
-        episodes: How many to show with pictures, the most telling first; all that kept them (see `wiw run
-            --keep-images`) if not given.
-        max_mb: Most megabytes of the file: pictures are made smaller, then episodes left out, until it fits.
-        judge: Judge whose marks are shown, by name or digest (see `wiw judge`); the run's own if not given.
+        out: File to write. Default: report.html in the run's folder.
+        episodes: Number of episodes to show with images, the most informative first. Default: all that kept them (see
+            `wiw run --keep-images`).
+        max_mb: Maximum file size in megabytes: images are shrunk, then episodes dropped, until it fits.
+        judge: Judge whose marks are shown, by name or digest (see `wiw judge`). Default: the run's own.
     """
     from wiw.report.tables import print_costs, print_fidelity
     from wiw.studies.run_log import load_run

@@ -24,7 +24,7 @@ if TYPE_CHECKING:
     from wiw.tasks.base import Task
 
 AGENT, TASK, SEARCH, SETTINGS, UNCHANGED = AgentFlags(), TaskFlags(), AgentConfig(), RunConfig(), ResumeConfig()
-"""What holds where the command line says nothing."""
+"""The defaults of the command line."""
 MaybeCount = Annotated[int | None, arg(metavar="N")]
 
 
@@ -57,24 +57,25 @@ def run(
     $ wiw run imagenav --arms none,warp --episodes 400 --salt 7f3a --shard 3/8 --out runs/a/3 --resume
     $ wiw run imagenav --policy isolated:my_policy.py:MyPolicy --world-model my_model.py:MyModel
 
-    Ctrl-C (exit code 130) or SIGTERM (75, within 6 seconds) stops a run without loss; `wiw resume` continues it.
+    Ctrl-C (exit code 130) or SIGTERM (75, within 6 seconds) stops a run without losing anything recorded; `wiw resume`
+    continues it.
 
     Args:
-        task: See `wiw list`.
+        task: Name of the task; see `wiw list`.
         parts: The agent.
-        arms: World models to run on the same episodes, or POLICY+MODEL for one with another policy; --world-model joins
-            them if it is not among them. placebo-shuffled and placebo-swapped let it (or warp) imagine as much, but
-            other plans, or from elsewhere; placebo-blind asks a text model with an empty prompt; placebo-shuffled:MODEL
-            names another. error-KIND@DOSE lets the futures of the oracle have an error, as error-blur@16 (`wiw list
-            errors`), error-blur@16:MODEL those of another model. NAME=MODEL?KEY=VALUE names an arm and gives its model
-            options, several with & between them (in quotes), besides those of --world-model-option.
-        noise_floor: Also run the arm of --world-model, or the last of --arms, once more with other random numbers
-            (reseeded:MODEL, which --arms takes too): the report says how much it differs from itself.
-        rules: What it is run on.
-        report: Whether to write report.html at the end; none of a shard.
-        dry_run: Whether to run nothing, and print what the preset sets and where the run would depart from the paper.
-        search: Numbers of the search.
-        config: How the run goes.
+        arms: World models to run on the same episodes, or POLICY+MODEL for one with another policy; --world-model is
+            added if it is not among them. placebo-shuffled and placebo-swapped let that model (or warp) compute as
+            much, but imagine other plans, or from another episode; placebo-blind gives a text model an empty prompt;
+            placebo-shuffled:MODEL uses another model. error-KIND@DOSE, such as error-blur@16, adds an error to the
+            oracle's futures (`wiw list errors`); error-blur@16:MODEL adds it to another model's. NAME=MODEL?KEY=VALUE
+            names an arm and sets options of its model, separated by & (quote it), in addition to --world-model-option.
+        noise_floor: Also rerun the arm of --world-model, or the last of --arms, with other random numbers
+            (reseeded:MODEL, which --arms also accepts): the report says how much the arm differs from itself.
+        rules: The task's episodes and rules.
+        report: Whether to write report.html at the end; shards have none.
+        dry_run: Run nothing; print what the preset sets and where the run would depart from the paper.
+        search: The search's parameters.
+        config: Settings of the run.
     """
     from wiw.cli.announcement import announce_protocol
 
@@ -91,7 +92,7 @@ def run(
 
 
 def add_noise_floor(arms: str | None, world_model: str) -> str:
-    """Return the text of the arms with one more, which repeats the arm of the world model, or the last one."""
+    """Return the arms with one more, which repeats the arm of the world model, or the last one."""
     from wiw.runs.arm_text import parse_arm, split_arms
     from wiw.runs.recipes import RESEEDED
 
@@ -105,7 +106,7 @@ def add_noise_floor(arms: str | None, world_model: str) -> str:
 
 @dataclass(frozen=True)
 class PreparedRun:
-    """A run as its flags describe it."""
+    """A run as described by its flags."""
 
     task: TaskRecipe
     agent: AgentRecipe
@@ -128,7 +129,7 @@ def prepare_run(
     """Check the flags of a run, announce it, and return what they describe.
 
     Raises:
-        Error: a part that is not known or does not fit, or a setting out of range.
+        Error: an unknown or unsuitable part, or a setting out of range.
     """
     from wiw.cli.announcement import announce
     from wiw.runs.arm_text import parse_arm
@@ -158,23 +159,23 @@ def resume(
     report: bool = True,
     config: Annotated[ResumeConfig, arg(name="")] = UNCHANGED,
 ) -> int:
-    """Go on with a run that was stopped: only the episodes that have not ended are run.
+    """Resume a run that was stopped: only the episodes that have not finished are run.
 
     $ wiw resume runs/first
     $ wiw resume runs/first --retry-errors --deadline 1200
 
-    All that scores or measurements depend on stays as the run was begun.
+    Everything that scores or measurements depend on stays as it was when the run was started.
 
     Args:
         run: The run's folder.
-        workers: Processes; as many as it was begun with if not given.
+        workers: Number of processes. Default: as many as before.
         retry_errors: Whether to rerun episodes that ended with an infrastructure error.
-        scratch: Folder on a local disk, such as /tmp, where the store is written while the run goes on; needed where
-            the run's folder is on a network file system.
-        engine: As for `wiw run`; what it was begun with if not given.
-        address: Ray cluster; the one it was begun with if not given.
+        scratch: Folder on a local disk, such as /tmp, where the store is written during the run; needed if the run's
+            folder is on a network file system.
+        engine: As for `wiw run`. Default: the engine it was started with.
+        address: Ray cluster. Default: the one it was started with.
         report: Whether to write report.html at the end.
-        config: What may change.
+        config: Settings that may change.
     """
     from wiw.studies.evaluate import resume_run
 
@@ -184,7 +185,7 @@ def resume(
 
 
 def finish(log: Any, report: bool, remark: str = "") -> int:
-    """Print tables and errors, write the report, with a remark; return 1 if the run is invalid."""
+    """Print tables and errors, and write the report with a remark; return 1 if the run is invalid."""
     from wiw.report.tables import print_fidelity
 
     numbers = log.summary()
@@ -199,9 +200,9 @@ def finish(log: Any, report: bool, remark: str = "") -> int:
             file=sys.stderr,
         )
         print(f"Once the cause is fixed:  wiw resume {log.path} --retry-errors", file=sys.stderr)
-    print(f"\nset-up  {log.store.info.get('preparation_seconds', 0.0):.1f} s for scenes and episodes")
+    print(f"\nset-up  {log.store.info.get('preparation_seconds', 0.0):.1f} s to prepare scenes and episodes")
     if log.store.shard is not None:
-        print(f"shard   {log.store.shard}; merge all of them with `wiw merge`")
+        print(f"shard   {log.store.shard}; merge all shards with `wiw merge`")
     elif report:
         print(f"report  {log.report(remark=remark)}")
     print(f"run     {log.path}")

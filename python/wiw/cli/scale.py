@@ -18,7 +18,7 @@ from wiw.runs.config import RunConfig
 
 Values = Annotated[str | None, arg(metavar="A,B,...")]
 AGENT, TASK, SEARCH, SETTINGS = AgentFlags(world_model="warp"), TaskFlags(), PlanConfig(), RunConfig()
-"""What holds where the command line says nothing."""
+"""The defaults of the command line."""
 
 
 def scale(
@@ -32,22 +32,23 @@ def scale(
     search: Annotated[PlanConfig, arg(name="")] = SEARCH,
     config: Annotated[RunConfig, arg(name="")] = SETTINGS,
 ) -> int:
-    """Success against the number of futures that a world model imagines, all amounts on the same episodes.
+    """Measure success against the number of futures that a world model imagines, always on the same episodes.
 
       $ wiw scale imagenav --world-model warp --candidates 1,2,4,8
       $ wiw scale imagenav --world-model my_model.py:MyModel --imagine-fraction 0,0.25,0.5,0.75,1
 
-    The amounts are nested: fewer candidates are the first of the most, and a smaller share of decisions is part of a
-    larger one. Writes scale.json and scale.svg beside the run, which `wiw resume` and `wiw report` know as any other.
+    The amounts are nested: a smaller number of candidates takes the first of the largest number, and a smaller share of
+    decisions is a subset of a larger one. Writes scale.json and scale.svg next to the run, which works with `wiw
+    resume` and `wiw report` like any other.
 
     Args:
         task: See `wiw list`.
         parts: The agent.
-        candidates: Plans imagined at each decision; 1,2,4,8 if neither this nor --imagine-fraction is given.
-        imagine_fraction: Shares of decisions for which the world model is consulted, from 0 to 1.
-        rules: What it is run on.
-        search: Numbers of the search that all amounts share.
-        config: How the run goes; a folder as cache is shared by the amounts.
+        candidates: Numbers of plans imagined at each decision. Default: 1,2,4,8, unless --imagine-fraction is given.
+        imagine_fraction: Shares of decisions, from 0 to 1, for which the world model is consulted.
+        rules: The task's episodes and rules.
+        search: The search's other parameters, the same for all amounts.
+        config: Settings of the run; if the cache is a folder, all amounts share it.
     """
     from wiw.studies.scale import scale as run_scale
 

@@ -17,16 +17,16 @@ def draw_scenes(
     views: Annotated[int, arg(metavar="N")] = 2,
     backend: Literal["auto", "cpu", "gpu"] = "auto",
 ) -> int:
-    """Load scenes, print their sizes, and draw a contact sheet: each scene from above, and panoramas from inside.
+    """Load scenes, print their sizes, and draw a contact sheet: each scene from above, and panoramas inside it.
 
     $ wiw scenes apartments:val:4
     $ wiw scenes house.glb --out house.png
 
     Args:
-        spec: apartments:train|val|test[[:FIRST]:END], one with edits (apartments:val/3?state:floor_lamp_1=off), a mesh
-            (GLB, glTF, OBJ, PLY, DAE), a Gazebo world, or scans (hm3d:DIR:val, mp3d:DIR, replica:DIR, hssd:DIR,
+        spec: apartments:train|val|test[[:FIRST]:END], a scene with edits (apartments:val/3?state:floor_lamp_1=off), a
+            mesh (GLB, glTF, OBJ, PLY, DAE), a Gazebo world, or scans (hm3d:DIR:val, mp3d:DIR, replica:DIR, hssd:DIR,
             replicacad:DIR, procthor:DIR).
-        out: Where to write the sheet, a PNG.
+        out: PNG file to write.
         views: Panoramas per scene.
         backend: Renderer.
     """
@@ -65,16 +65,16 @@ def verify_scans(
     folder: Positional[Annotated[str, arg(metavar="DIR|SPEC")]],
     /,
 ) -> int:
-    """Open every scan of a dataset, and print what is wrong; exit code 1 if anything is.
+    """Open every scan in a dataset and print what is wrong; exit code 1 if anything is.
 
     $ wiw scenes verify scene_datasets/mp3d
     $ wiw scenes verify hm3d:scene_datasets/hm3d:val
 
     Textures, objects, categories, rooms and walkable area are counted and compared with the dataset's own files. Scans
-    are kept in the cache as they are read, so that runs open them fast.
+    are cached as they are read, so that runs open them fast.
 
     Args:
-        folder: A dataset's folder, that of one scan, or a spec such as hm3d:DIR:val.
+        folder: Folder of a dataset or of one scan, or a spec such as hm3d:DIR:val.
     """
     from rich.console import Console
     from rich.table import Table
@@ -82,7 +82,7 @@ def verify_scans(
     from wiw.cli.terminal import printable
     from wiw.datasets.scan_check import check_scan
     from wiw.datasets.scene_splits import name_scene
-    from wiw.scenes.scans import find_all, find_scans, parse_spec
+    from wiw.scenes.scans.formats import find_all, find_scans, parse_spec
 
     spec = parse_spec(folder)
     files = find_scans(*spec) if spec else find_all(Path(folder))
@@ -103,7 +103,7 @@ def verify_scans(
         )
     Console().print(table)
     if any(check.navmesh == "built" for check in checks):
-        print("* by a navigation mesh that was built: none came with the scan")
+        print("* on a navigation mesh built here, as the scan came without one")
     for check in checks:
         lines = [f"  wrong: {line}" for line in check.problems] + [f"  note: {line}" for line in check.remarks]
         if lines:
@@ -114,7 +114,7 @@ def verify_scans(
 
 
 LIMIT = 8
-"""Scenes on a sheet."""
+"""Maximum number of scenes on a sheet."""
 
 
 def _load(name: str, backend: Any) -> Any:

@@ -51,25 +51,26 @@ def serve(
     $ wiw serve svd --host 0.0.0.0 --port 0 --announce servers/1.json --idle 1800
     $ wiw run imagenav --arms none,svd=remote:servers
 
-    The server batches the rows of all episodes of all clients. If it is killed, clients wait for it to come back, as
+    The server batches rows across all episodes of all clients. If it is killed, clients wait for it to come back, as
     long as their deadlines allow, and repeat unanswered requests. On SIGTERM or Ctrl-C it finishes the accepted rows
-    and ends; a second signal ends it at once. Run `wiw check-model MODEL` first to see whether the model keeps its
-    contract; docs/serving.md has the protocol.
+    and exits; a second signal makes it exit at once. Run `wiw check-model MODEL` first to see whether the model keeps
+    its contract; docs/serving.md describes the protocol.
 
     Args:
         model: Name, path.py:Class or package.module:Class. See `wiw list`.
-        world_model_option: An option of the model, such as weights=FOLDER or steps=30; may be given again.
+        world_model_option: An option of the model, such as weights=FOLDER or steps=30; may be repeated.
         host: Address to listen on; any but the loopback address requires a token.
         port: Port to listen on; 0 picks a free one.
-        token: Secret that clients must send; WIW_TOKEN if not given, which other users of the machine cannot see.
-        queue: Rows that may wait before clients are asked to retry; eight full batches, and at least 64, if not given.
-        window: How long a batch that is not full waits for idle clients, as a share of a batch's time.
-        certificate: PEM file, for wss.
-        key: PEM file of the certificate's key, if it is not in the same file.
+        token: Secret that clients must send. Default: the environment variable WIW_TOKEN, which other users of the
+            machine cannot see.
+        queue: Rows that may wait before clients are asked to retry. Default: eight full batches, and at least 64.
+        window: How long an incomplete batch waits for idle clients, as a fraction of a batch's run time.
+        certificate: PEM file of the certificate, for wss.
+        key: PEM file of the certificate's key, if separate.
         grace: Time limit in seconds for finishing the accepted rows.
-        announce: File (.json) in which to announce address and token as long as it serves; clients are given its
-            folder. Only its owner can read it. Without --token one is made up.
-        idle: Seconds without any client after which the server ends; never if not given.
+        announce: File (.json) that announces address and token while the server is up; clients are given its folder.
+            Only its owner can read it. Without --token a random one is used.
+        idle: Seconds without any client after which the server exits. Default: never.
     """
     from wiw.registry import WORLD_MODELS
     from wiw.runs.part_options import parse_options
@@ -84,7 +85,7 @@ def serve(
 
 
 async def _live(server: Any, name: str, announce: Path | None, idle: float | None) -> None:
-    """Serve until a signal arrives or nobody has asked for long, announce the server, and print status lines."""
+    """Serve until a signal arrives or the server has been idle for too long; announce it and print status lines."""
     loop, signals = asyncio.get_running_loop(), 0
     ready = asyncio.Event()
     announcing = ExitStack()
@@ -100,7 +101,7 @@ async def _live(server: Any, name: str, announce: Path | None, idle: float | Non
         nonlocal signals
         signals += 1
         if signals == 1:
-            left = f"finishing {server.pending_rows} rows that were taken" if server.pending_rows else "ending"
+            left = f"finishing {server.pending_rows} accepted rows" if server.pending_rows else "ending"
             print(f"\nwiw serve: {left}", file=sys.stderr, flush=True)
             server.end()
         else:
@@ -122,7 +123,7 @@ async def _live(server: Any, name: str, announce: Path | None, idle: float | Non
 
 
 def _find_address(server: Any) -> ServerAddress:
-    """Return where other machines find a server: by this machine's name, unless it listens to this machine alone."""
+    """Return the address at which other machines reach a server: by this machine's name, unless it is local only."""
     split = urlsplit(server.address)
     everywhere = split.hostname in ("0.0.0.0", "::")
     address = f"{split.scheme}://{platform.node()}:{split.port}" if everywhere else server.address
@@ -130,7 +131,7 @@ def _find_address(server: Any) -> ServerAddress:
 
 
 async def _end_if_idle(server: Any, seconds: float, ready: asyncio.Event) -> None:
-    """End a server once it has had no client for so long."""
+    """Stop a server once it has had no client for so many seconds."""
     await ready.wait()
     last = time.monotonic()
     while time.monotonic() - last < seconds:

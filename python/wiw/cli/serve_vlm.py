@@ -31,11 +31,11 @@ def serve_vlm(
 
     Args:
         model: tiny, a model with random weights, built on the spot; mock, with random answers; a folder or hub name for
-            transformers; or a function that takes each call and returns text, or a probability for each first token.
+            transformers; or a function that takes a call and returns a text, or a probability for each first token.
         host: Address to listen on; any but the loopback address requires a token.
         port: Port to listen on; 0 picks a free one.
-        token: Secret that clients must send as OPENAI_API_KEY; WIW_TOKEN if not given.
-        announce: File (.json) in which to announce address and token as long as it serves.
+        token: Secret that clients must send as OPENAI_API_KEY. Default: the environment variable WIW_TOKEN.
+        announce: File (.json) that announces address and token while the server is up.
         seed: Seed of the random weights.
     """
     import tempfile

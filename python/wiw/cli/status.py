@@ -14,16 +14,16 @@ from wiw.errors import ArgumentError
 
 
 def status(runs: Positional[Annotated[tuple[Path, ...], arg(metavar="RUN [RUN ...]")]], /) -> int:
-    """Show how far runs are: shards, ended episodes, errors, time left. Only reads, also while runs are going on.
+    """Show the progress of runs: shards, finished episodes, errors, time left. Read-only, so safe during a run.
 
     $ wiw status runs/first
     $ wiw status runs/a runs/b
 
-    States: done; running (by a process of this machine); on HOST (run by another machine when it was last written);
-    stopped. The time left is estimated from the episodes that have ended since the present process began.
+    States: done; running (by a process on this machine); on HOST (run by another machine when last written); stopped.
+    The time left is estimated from the episodes finished since the current process started.
 
     Args:
-        runs: Folders of runs, or folders that hold the folders of shards.
+        runs: Folders of runs, or folders that contain the folders of shards.
     """
     if not runs:
         raise ArgumentError("status: expected at least one run, as in `wiw status runs/first`; got none")
@@ -32,7 +32,7 @@ def status(runs: Positional[Annotated[tuple[Path, ...], arg(metavar="RUN [RUN ..
 
 
 def _describe(run: Path) -> str:
-    """Return how far a run is, and the states of the jobs that were submitted for it."""
+    """Return a run's progress, and the states of the jobs submitted for it."""
     from wiw.errors import StoreError
     from wiw.runs.status import status as read_status
     from wiw.runs.submission import find_states

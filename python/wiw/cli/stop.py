@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""SIGTERM and SIGUSR2: the run is closed within seconds, whatever it is doing; the exit code says it can be resumed."""
+"""Handle SIGTERM and SIGUSR2: close the run within seconds, whatever it is doing, with an exit code for "resume me"."""
 
 from __future__ import annotations
 
@@ -16,22 +16,22 @@ from types import FrameType
 from typing import Any, NoReturn
 
 EXIT_RESUME = 75
-"""EX_TEMPFAIL: whoever stopped the run, such as a batch system, may start `wiw resume`."""
+"""EX_TEMPFAIL: whatever stopped the run, such as a batch system, may call `wiw resume`."""
 STOPPING = (signal.SIGTERM, signal.SIGUSR2)
-"""SIGUSR2 is what SLURM sends jobs of submitit before their time is up, to all their processes."""
+"""SIGUSR2 is what SLURM sends to all processes of submitit's jobs before their time is up."""
 GRACE = 4.0
-"""Seconds for closing everything in order; after that the process ends, for each record is on disk once it is made."""
+"""Seconds for an orderly shutdown; then the process exits, which loses nothing, as every record is already on disk."""
 
 
 class Terminated(BaseException):
-    """SIGTERM or SIGUSR2 has come; raised so that everything is closed on the way out."""
+    """SIGTERM or SIGUSR2 was received; raised so that everything is closed on the way out."""
 
 
 def end_process(code: int) -> NoReturn:
-    """End the process with an exit code, also while threads of models are still inside compiled code.
+    """End the process with an exit code, even while threads of models are still inside compiled code.
 
-    Python's shutdown ends such a thread as it comes back from a call, by unwinding its C++ frames; where these do not
-    allow that, the process aborts (SIGABRT) in place of its exit code. So once the exit handlers have run and the
+    Python's shutdown ends such a thread when it returns from a call, by unwinding its C++ frames; if these do not allow
+    that, the process aborts (SIGABRT) instead of returning its exit code. So once the exit handlers have run and the
     output is flushed, the process ends without a shutdown if any other thread is alive.
     """
     if threading.active_count() == 1:
@@ -45,9 +45,10 @@ def end_process(code: int) -> NoReturn:
 
 @contextmanager
 def raise_on_stop_signals() -> Iterator[None]:
-    """Raise `Terminated` at the first of `STOPPING`; end the process where the work does not get to it, as in a model.
+    """Raise `Terminated` at the first of `STOPPING`; end the process if the work does not react, as inside a model.
 
-    Python runs signal handlers only between its own instructions, so a thread, notified by a pipe, enforces the end.
+    Python runs signal handlers only between its own instructions, so a thread, notified through a pipe, enforces the
+    end.
     """
     watch, tell = os.pipe()
     os.set_blocking(tell, False)
@@ -75,7 +76,7 @@ def _terminate(number: int, frame: FrameType | None) -> None:
 
 
 def _note(number: int, frame: FrameType | None) -> None:
-    """Do nothing. Python complains of a signal that has come and is then ignored by `SIG_IGN`."""
+    """Do nothing. Python complains about a signal that arrives and is then ignored with `SIG_IGN`."""
 
 
 def _guard(watch: int, done: threading.Event) -> None:
@@ -84,8 +85,8 @@ def _guard(watch: int, done: threading.Event) -> None:
             for worker in multiprocessing.active_children():
                 worker.kill()
             print(
-                "wiw: stopped at once; all that was recorded is kept. Go on with `wiw resume`, or "
-                "collect and train with the same command",
+                "wiw: stopped at once; everything recorded is kept. Continue a run with `wiw resume`, collecting or "
+                "training with the same command",
                 file=sys.stderr,
             )
             sys.stderr.flush()
@@ -100,13 +101,13 @@ def stoppable(work: Callable[[], Any], folder: Path, command: str = "resume") ->
         return work()
     except BaseException as stop:
         if not isinstance(stop, Exception | SystemExit) and store_path(folder).exists():
-            print(f"\nstopped; everything so far is kept. Go on with:  wiw {command} {folder}", file=sys.stderr)
+            print(f"\nstopped; everything so far is kept. Continue with:  wiw {command} {folder}", file=sys.stderr)
         raise
 
 
 @contextmanager
 def announce_resume(aloud: bool = True) -> Iterator[None]:
-    """Run work that keeps finished parts; if it is stopped, print that the same command resumes it, if `aloud`."""
+    """Run work that keeps finished parts; if it is stopped and `aloud`, print that the same command resumes it."""
     try:
         yield
     except (KeyboardInterrupt, Terminated):

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""`wiw study data-scaling`, `wiw study errors`, and all studies that are commands of their own (`STUDIES`)."""
+"""`wiw study data-scaling` and `wiw study errors`: the studies with their own commands (`STUDIES`)."""
 
 from __future__ import annotations
 
@@ -27,38 +27,38 @@ def study_data_scaling(
     imagenav: Annotated[int, arg(metavar="EPISODES")] = 0,
     workers: Annotated[int, arg(metavar="N")] = 1,
 ) -> int:
-    """Does a world model get better with data, or with updates? Small models, trained on nested parts of a dataset.
+    """Does a world model improve with data, or with updates? Train small models on nested subsets of a dataset.
 
     $ wiw study data-scaling --small --workers 2               # collects its own data; under an hour on two cores
     $ wiw collect navigation --scenes apartments:train:80 --out data --workers 4
     $ wiw study data-scaling --data data --workers 4           # 128 to 12,800 clips in 64x128; hours
     $ wiw study data-scaling --data data --models warpnet --seeds 0,1,2 --imagenav 100
 
-    The paper trains on more and more clips for one epoch each, so more clips are also more updates. Three arms take
-    this apart: one epoch, as in the paper; every size for as many updates as the largest; and the same number of clips
-    from fewer scenes. plan.json says what is measured and how it is judged, before anything is trained: the error of
-    held-out frames after 4 actions, and the regret of choices in stored decisions. The page has trends, fits with
-    bootstrap intervals, and how much of the gain the smallest size has when it is trained as long as the largest.
+    The paper trains on more and more clips for one epoch each, so more clips also mean more updates. Three arms
+    separate the two: one epoch, as in the paper; every size for as many updates as the largest; and the same number of
+    clips from fewer scenes. Before anything is trained, plan.json records what is measured and how it is judged: the
+    error of held-out frames after 4 actions, and the regret of choices in stored decisions. The page shows trends, fits
+    with bootstrap intervals, and how much of the gain the smallest size achieves when trained as long as the largest.
 
-    Writes data-scaling.html, .svg, .png and .json, and all weights, into the folder. After Ctrl-C the same command goes
-    on; a training loses a minute at most. docs/data-scaling.md has what came out here.
+    Writes data-scaling.html, .svg, .png and .json, and all weights, into the folder. After Ctrl-C the same command
+    continues; a training loses a minute at most. docs/data-scaling.md has our results.
 
     Args:
-        data: Folder of `wiw collect navigation`, of panoramas with depth. If not given, 16 apartments are collected in
-            128x256 into --out, which are enough for --small.
-        out: New folder, or one that the same command began.
-        small: Whether to take the numbers of the small version where no others are given: 32x64 pixels, 3,200 clips.
-        models: Of warpnet and pocket; both if not given.
-        clips: The largest size; the smallest is a hundredth of it. 12,800 if not given.
-        sizes: How many sizes, evenly spaced in logarithm; 4 if not given.
-        size: Height and width that panoramas are brought to; 64 128 if not given.
-        seeds: Each draws other clips and scenes, and other weights to begin with; 0,1 if not given.
-        held_out: Share of the dataset's scenes that is held out; 0.25 if not given.
-        held_out_clips: Clips of these that models are measured on; 200 if not given.
-        decision_scenes: Scenes of the stored decisions; apartments:val:40 if not given.
-        decisions_per_scene: Decisions in each, fewer where there is no room; 30 if not given.
-        imagenav: Episodes of ImageNav in which the models of the first seed are run too; none if 0.
-        workers: Processes, each with one thread; the result does not depend on it.
+        data: Folder of `wiw collect navigation`, with panoramas and depth. Default: collect 16 apartments at 128x256
+            into --out, which is enough for --small.
+        out: New folder, or one that the same command started.
+        small: Use the small version's numbers where none are given: 32x64 pixels, 3,200 clips.
+        models: Models to train, of warpnet and pocket. Default: both.
+        clips: The largest number of clips; the smallest is a hundredth of it. Default: 12,800.
+        sizes: Number of sizes, evenly spaced on a logarithmic scale. Default: 4.
+        size: Height and width to which panoramas are resized. Default: 64 128.
+        seeds: Seeds; each samples its own clips, scenes and initial weights. Default: 0,1.
+        held_out: Share of the dataset's scenes that is held out. Default: 0.25.
+        held_out_clips: Held-out clips that models are evaluated on. Default: 200.
+        decision_scenes: Scenes of the stored decisions. Default: apartments:val:40.
+        decisions_per_scene: Decisions per scene, fewer if there is no room. Default: 30.
+        imagenav: Episodes of ImageNav in which to run the first seed's models as well; 0 for none.
+        workers: Number of processes, each with one thread; results do not depend on it.
     """
     from dataclasses import replace
 
@@ -110,43 +110,43 @@ def study_errors(
     read_only: bool = False,
     workers: Annotated[int, arg(metavar="N")] = 1,
 ) -> int:
-    """Find which kind of error costs success: true futures are made worse by known doses, one error at a time.
+    """Find out which kinds of error cost success, by degrading true futures with known doses of one error at a time.
 
     $ wiw study errors --small --workers 2                     # imagenav, four errors; about three minutes on two cores
     $ wiw study errors --tasks imagenav --size 144 256 --workers 4
     $ wiw study errors --tasks imagenav --preset foresight --tier beyond --size 144 256
     $ wiw study errors --workers 16 --lpips auto               # all tasks, errors and doses: hours
-    $ wiw study errors --tasks ar --read-only                  # tables and page of what has been run so far
+    $ wiw study errors --tasks ar --read-only                  # tables and page of everything run so far
 
-    There are errors of looks (blur, noise, tint, resolution), flicker, control (scale, direction, lag, drift, ignored)
-    and content (missing, moved, invented, open); `wiw list errors` says what each does and the unit of its doses. All
-    arms, none and oracle among them, run on the same episodes, and every number is paired with the oracle: success,
-    regret of the choices, and how far frames and cameras were from the true ones. An error that makes no sense in a
-    task is left out and named.
+    The errors concern looks (blur, noise, tint, resolution), flicker, control (scale, direction, lag, drift, ignored)
+    and content (missing, moved, invented, open); `wiw list errors` explains each one and the unit of its doses. All
+    arms, including none and oracle, run on the same episodes, and every number is paired with the oracle's: success,
+    regret of the choices, and the distance of frames and cameras from the true ones. Errors that make no sense in a
+    task are skipped and listed.
 
-    Writes errors.html, .svg, .png and .json into the folder, beside ordinary runs that hold a few episodes each, of all
-    arms. After Ctrl-C the same command goes on, and with more kinds, doses or tasks it adds these. Any run takes single
-    errors as arms: `wiw run imagenav --arms none,error-blur@16,oracle`. docs/errors.md has what came out here.
+    Writes errors.html, .svg, .png and .json into the folder, next to ordinary runs with a few episodes of all arms
+    each. After Ctrl-C the same command continues; with more kinds, doses or tasks it adds them. Any run accepts single
+    errors as arms: `wiw run imagenav --arms none,error-blur@16,oracle`. docs/errors.md has our results.
 
     Args:
-        out: New folder, or one that the same command began.
-        small: Whether to take the numbers of the small version where no others are given.
-        tasks: Of imagenav, ar, aeqa and manipulation; all if not given.
-        kinds: Of the errors; all if not given.
-        doses: How many doses of each, the largest ones; 3 if not given.
-        episodes: Of each task; 100 if not given.
-        seed: Of all randomness; 0 if not given.
-        scenes: As in `wiw run`, of tasks in which an agent walks.
-        per_scene: Episodes in a scene; 2 if not given, as intervals are over scenes.
-        preset: Rules of the tasks, as in `wiw run`; each task's default if not given.
-        tier: Of imagenav, as in `wiw run`.
-        policy: The preset's, or else the task's own, if not given.
-        size: Height and width of the oracle's frames; 576 1024, or 480 480 before a table, if not given. The policy
-            matcher looks at 64x128, so that less is enough and several times faster.
-        fidelity_share: Share of the decisions at which regret and distances are measured; 0.25 if not given.
-        lpips: Weights of LPIPS (see `wiw run --lpips`); 1 - SSIM takes its place if not given.
-        read_only: Whether to run nothing, and show what is there.
-        workers: Processes; results do not depend on it.
+        out: New folder, or one that the same command started.
+        small: Use the small version's numbers where none are given.
+        tasks: Tasks, of imagenav, ar, aeqa and manipulation. Default: all.
+        kinds: Kinds of error. Default: all.
+        doses: Number of doses of each, counted from the largest. Default: 3.
+        episodes: Episodes of each task. Default: 100.
+        seed: Seed of all randomness. Default: 0.
+        scenes: Scenes, as in `wiw run`, for tasks in which an agent walks.
+        per_scene: Episodes per scene. Default: 2, as intervals are over scenes.
+        preset: Preset of the tasks, as in `wiw run`. Default: each task's default.
+        tier: Tier of imagenav, as in `wiw run`.
+        policy: Policy. Default: the preset's, or else the task's.
+        size: Height and width of the oracle's frames. Default: 576 1024, or 480 480 for manipulation. Policy matcher
+            only looks at 64x128, so a smaller size is enough for it and several times faster.
+        fidelity_share: Share of the decisions at which regret and distances are measured. Default: 0.25.
+        lpips: Weights of LPIPS (see `wiw run --lpips`). Default: none, 1 - SSIM instead.
+        read_only: Run nothing, and show what exists.
+        workers: Number of processes; results do not depend on it.
     """
     from dataclasses import replace
 
@@ -185,7 +185,7 @@ def study_errors(
 
 
 STUDIES: tuple[tuple[Callable[..., int], str, str], ...] = (
-    (study_data_scaling, "data-scaling", "Does a world model get better with data, or with updates?"),
-    (study_errors, "errors", "What kind of error of imagined futures costs success?"),
+    (study_data_scaling, "data-scaling", "Does a world model improve with data, or with updates?"),
+    (study_errors, "errors", "Which kinds of error in imagined futures cost success?"),
 )
-"""Studies with commands of their own: function, name and summary; the others are YAML files."""
+"""Studies with their own commands: function, name and summary; the others are YAML files."""

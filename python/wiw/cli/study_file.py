@@ -18,7 +18,7 @@ def run_study(
     small: bool = False,
     workers: Annotated[int, arg(metavar="N")] = 1,
 ) -> int:
-    """Run a study: the runs that its file lists, with its figures and tables on one page.
+    """Run a study: execute the runs listed in its file, and write a page with its figures and tables.
 
     $ wiw study front-vs-panorama --small
     $ wiw study vlm --set server=http://localhost:8000/v1 --set model=qwen2.5-vl-72b-awq --workers 2
@@ -26,16 +26,16 @@ def run_study(
     $ wiw study my.yaml --set episodes=100
 
     Writes study.html, study.json, study.yaml (the file with its variables filled in) and an SVG of each figure. Each
-    run is a folder beside them, which `wiw report` and `wiw compare` know as any other. After Ctrl-C the same command
-    goes on; a finished study only draws its page again, and one that has gained runs or arms runs these. `wiw list
-    studies` names the shipped ones, `wiw study --help` shows how to write one.
+    run is a folder next to them, which works with `wiw report` and `wiw compare` like any other. After Ctrl-C the same
+    command continues; for a finished study it only redraws the page, and runs or arms added since are run. `wiw list
+    studies` lists the built-in ones, `wiw study --help` shows how to write one.
 
     Args:
-        study: Name, or path of a YAML file.
-        out: Folder; runs/study-NAME if not given.
-        set: Value of one of the study's variables, as YAML; may be given again.
-        small: Whether to take the study's small values, for a look at it.
-        workers: Processes; results do not depend on it.
+        study: Name of a study, or path of a YAML file.
+        out: Folder to write. Default: runs/study-NAME.
+        set: Value of one of the study's variables, as YAML; may be repeated.
+        small: Use the study's small values, for a quick look.
+        workers: Number of processes; results do not depend on it.
     """
     from wiw.cli.stop import announce_resume
     from wiw.studies.study import study as run

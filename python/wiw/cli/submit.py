@@ -23,9 +23,9 @@ from wiw.runs.submission import FILE_NAME, ClusterConfig, SubmittedJob
 
 CLUSTER = ClusterConfig()
 SERVERS = "servers"
-"""Folder in that of the run in which servers announce themselves."""
+"""Subfolder of the run's folder in which servers announce themselves."""
 IDLE = "1800"
-"""Seconds without a client after which a server ends."""
+"""Seconds without a client after which a server exits."""
 
 
 def submit(
@@ -42,7 +42,7 @@ def submit(
     search: Annotated[AgentConfig, arg(name="")] = SEARCH,
     config: Annotated[RunConfig, arg(name="")] = SETTINGS,
 ) -> int:
-    """Run an agent in shards, as an array of SLURM jobs. Takes the flags of `wiw run`; needs wiw[slurm].
+    """Run an agent in shards, as an array of SLURM jobs. Takes the flags of `wiw run`; requires wiw[slurm].
 
     $ wiw submit imagenav --arms none,warp --episodes 400 --shards 8 --partition cpu --out runs/a
     $ wiw submit imagenav --world-model svd --shards 4 --partition gpu --gpus 1 --minutes 720 --out runs/b
@@ -52,31 +52,31 @@ def submit(
     $ wiw merge runs/a --out runs/a
     $ wiw cancel runs/a
 
-    Prints the command of each job, which a person can run by hand. A job writes its store on the node's own disk and
-    copies it to a folder in --out, which all nodes must see. Before the time limit, or when it is preempted, a job
-    stops, everything recorded, and is requeued. After a failure the same command, with the same --out, submits what is
-    left.
+    Prints the command of each job, which can also be run by hand. A job writes its store on the node's own disk and
+    copies it to a folder in --out, which all nodes must see. Shortly before its time limit, or when preempted, a job
+    stops with everything recorded and is requeued. After an error the same command, with the same --out, submits what
+    is left.
 
     Args:
         task: See `wiw list`.
-        shards: Number of parts of the episodes, each a job.
-        server_partition: SLURM partition of the jobs of --servers; --partition if not given. A server ends after half
-            an hour without a client.
-        jobs: What a job asks of the cluster.
-        dry_run: Whether to print the commands and submit nothing.
+        shards: Number of shards of the episodes, one job each.
+        server_partition: SLURM partition for the jobs of --servers. Default: --partition. A server exits after half an
+            hour without a client.
+        jobs: What a job requests from the cluster.
+        dry_run: Print the commands and submit nothing.
         parts: The agent.
         arms: As for `wiw run`.
-        rules: What it is run on.
-        search: Numbers of the search.
-        config: How the run goes.
+        rules: The task's episodes and rules.
+        search: The search's parameters.
+        config: Settings of the run.
     """
     from wiw.runs.submission import submit_commands
 
     for name in ("shard", "resume"):
         if getattr(config, name):
-            raise ArgumentError(f"submit: --{name} is what each job is given; leave it out")
+            raise ArgumentError(f"submit: --{name} is set for each job; leave it out")
     if config.served is not None:
-        raise ArgumentError("submit: --servers serve --world-model; --served is for --engine ray")
+        raise ArgumentError("submit: --servers always serve --world-model; --served is for --engine ray only")
     prepared = prepare_run(task, parts, arms, rules, search, replace(config, salt=_find_salt(config)))
     folder, count = Path(prepared.settings.out or ""), prepared.count
     Shard(1, shards).select(count)
@@ -100,28 +100,28 @@ def submit(
         submitted = submit_commands(folder, left, jobs, name, begun)
         print(f"\njobs    {submitted[0].id} to {submitted[-1].id}, output in {folder / 'jobs'}")
     if not left:
-        print("all shards have ended: there is nothing to submit")
+        print("all shards have finished: there is nothing to submit")
     print(f"then    wiw status {folder}\n        wiw merge {folder} --out {folder}")
     return 0
 
 
 def cancel(run: Positional[Annotated[Path, arg(metavar="RUN")]], /) -> int:
-    """Cancel the jobs of a run. Everything recorded is kept; `wiw submit` with the same flags goes on.
+    """Cancel the jobs of a run. Everything recorded is kept; `wiw submit` with the same flags continues.
 
     $ wiw cancel runs/a
 
     Args:
-        run: Folder that was given to `wiw submit` as --out.
+        run: Folder given to `wiw submit` as --out.
     """
     from wiw.runs.submission import cancel as cancel_jobs
 
-    told = cancel_jobs(run)
-    print(f"{run}: told {len(told)} jobs to end")
+    canceled = cancel_jobs(run)
+    print(f"{run}: canceled {len(canceled)} jobs")
     return 0
 
 
 def _find_salt(config: RunConfig) -> str:
-    """Return the salt that all shards have: as given, as they were submitted with before, or a new one."""
+    """Return the salt of all shards: the given one, that of an earlier submission, or a new one."""
     from wiw.runs.submission import read_jobs
 
     if config.salt is not None:
@@ -150,10 +150,10 @@ def _write_command(
 
 
 def _require_alone(folder: Path, commands: list[list[str]]) -> set[tuple[str, ...]]:
-    """Check that a run is submitted as it was before, and that nothing else writes its shards; return active servers.
+    """Check that a run is submitted with the same commands as before and no job writes its shards; return active jobs.
 
     Raises:
-        ArgumentError: other commands were submitted for it before, or shards of it still wait or run.
+        ArgumentError: it was submitted with other commands before, or some of its shards are still waiting or running.
     """
     from wiw.runs.submission import find_active, read_jobs
 
@@ -166,17 +166,17 @@ def _require_alone(folder: Path, commands: list[list[str]]) -> set[tuple[str, ..
     active = find_active(folder)
     if shards := [job for job in active if job.arguments[0] == "run"]:
         raise ArgumentError(
-            f"submit: job {shards[0].id} of {folder} is {shards[0].state}, and {len(shards)} in all; wait for them, or "
-            f"`wiw cancel {folder}` first{_explain_unknown(shards[0], folder)}"
+            f"submit: job {shards[0].id} of {folder} is {shards[0].state} ({len(shards)} active in all); wait for "
+            f"them, or `wiw cancel {folder}` first{_explain_unknown(shards[0], folder)}"
         )
     return {job.arguments for job in active}
 
 
 def _explain_unknown(job: SubmittedJob, folder: Path) -> str:
-    """Return the way out where the cluster no longer says, or never did, what became of a job."""
+    """Return what to do if the cluster does not say, or no longer says, what became of a job."""
     if not job.state.startswith("UNKNOWN"):
         return ""
-    return f"; if it says so for good and they have ended (see squeue), remove {folder / FILE_NAME}"
+    return f"; if this does not change and the jobs have ended (see squeue), remove {folder / FILE_NAME}"
 
 
 def _write_servers(folder: Path, parts: AgentFlags, count: int, cluster: str) -> list[list[str]]:
@@ -186,7 +186,7 @@ def _write_servers(folder: Path, parts: AgentFlags, count: int, cluster: str) ->
         ArgumentError: there is no world model.
     """
     if count and parts.world_model == "none":
-        raise ArgumentError("submit: --servers serve --world-model, and none is given; name one, or leave them out")
+        raise ArgumentError("submit: --servers serve --world-model, but none is given; name one or omit --servers")
     options = [part for option in parts.world_model_option for part in ("--world-model-option", option)]
     listen = ["--host", "127.0.0.1" if cluster == "local" else "0.0.0.0", "--port", "0", "--idle", IDLE]
     return [
@@ -200,7 +200,7 @@ def _name_servers(folder: Path) -> str:
 
 
 def _ask_servers(prepared: PreparedRun, folder: Path) -> str:
-    """Return the arms of a run with the served model in place of its own, under the same name."""
+    """Return the arms of a run with its model replaced by the served one, under the same name."""
     from wiw.runs.arm_text import parse_arm
 
     own = str(prepared.agent.model)
@@ -209,7 +209,7 @@ def _ask_servers(prepared: PreparedRun, folder: Path) -> str:
 
 
 def _is_done(shard: Path) -> bool:
-    """Return whether a shard has ended all its episodes."""
+    """Return whether a shard has finished all its episodes."""
     from wiw.runs.status import status
     from wiw.runs.store_file import store_path
 

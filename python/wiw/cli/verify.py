@@ -21,12 +21,12 @@ def verify(
     $ wiw verify runs/first
     $ wiw verify runs/first --episodes 10 --seed 1
 
-    Names the first decision that differs, and how. Exit code 0 if nothing differs, 1 otherwise.
+    Prints the first decision that differs, and how. Exit code 0 if nothing differs, 1 otherwise.
 
     Args:
         run: The run's folder.
-        episodes: Number of episodes, drawn at random; all if the run has fewer.
-        seed: Seed of that draw.
+        episodes: Number of episodes, sampled at random; all if the run has fewer.
+        seed: Seed of that sample.
     """
     from wiw.runs.verify import verify as check
 

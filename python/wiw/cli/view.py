@@ -23,14 +23,14 @@ def view(
     $ wiw view runs/first
     $ wiw view runs/first --out pages
 
-    A page shows the agent's observation, the imagined frames of each plan (beside the true ones, if the run measured
-    fidelity), scores, choice, cost, and the path on the map. Pictures exist for the episodes that keep them;
-    `wiw run --keep-images all` keeps those of every decision. Also works during the run.
+    A page shows the agent's observation, the imagined frames of each plan (next to the true ones, if the run measured
+    fidelity), scores, choice, cost, and the path on the map. Images are shown for the episodes that kept them; `wiw run
+    --keep-images all` keeps them for every decision. Also works while the run is still going.
 
     Args:
         run: The run's folder.
-        out: Folder to write, new or with an older view; `view` in the run's folder if not given.
-        judge: Judge whose marks are shown, by name or digest (see `wiw judge`); the run's own if not given.
+        out: Folder to write, new or with an older view. Default: `view` in the run's folder.
+        judge: Judge whose marks are shown, by name or digest (see `wiw judge`). Default: the run's own.
     """
     from wiw.report.site import write_view
     from wiw.studies.run_log import load_run
@@ -38,5 +38,5 @@ def view(
     log = load_run(run, judge)
     site = write_view(log, out or log.path / "view")
     megabytes = site.size / 1e6
-    print(f"{site.episodes} episodes, {site.pictures} pictures of {megabytes:.1f} MB\nview    {site.index}")
+    print(f"{site.episodes} episodes, {site.pictures} images, {megabytes:.1f} MB\nview    {site.index}")
     return 0

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The table of `wiw list world-models`: inputs, outputs, weights, and what each model lacks on this machine."""
+"""Build the table of `wiw list world-models`: inputs, outputs, weights, and what each model lacks on this machine."""
 
 from __future__ import annotations
 
@@ -9,14 +9,14 @@ from typing import Any
 from wiw.registry import WORLD_MODELS
 
 GAP = 2
-"""Spaces between columns, and before what is said below a row."""
+"""Spaces between columns, and before the lines below a row."""
 INPUT = 2
-"""The column that is folded where the terminal is narrow."""
+"""The column that is folded if the terminal is narrow."""
 HEADS = ("name", "control", "input", "output", "size", "frames")
 CAPTION = (
-    "Control is what tells a model of the plan. NAME-action is the paper's NAME†; what remote: takes its server says. "
-    "Weights are downloaded at first use, into the Hugging Face cache; --world-model-option weights=FOLDER takes those "
-    "of a folder."
+    "Control is how a model is told the plan. NAME-action is the paper's NAME†; remote: takes whatever its server "
+    "takes. Weights are downloaded into the Hugging Face cache on first use; --world-model-option weights=FOLDER uses "
+    "a local folder."
 )
 
 
@@ -29,7 +29,7 @@ class _Row:
 
 
 def world_models(width: int) -> Any:
-    """All registered models for a terminal of so many columns: a row of cells each, and below it weights and status."""
+    """List all registered models for a terminal of so many columns: a row each, weights and status below it."""
     from rich.console import Group
     from rich.text import Text
 
@@ -62,8 +62,8 @@ def _indent(text: Any) -> Any:
 
 
 def _make_row(name: str) -> _Row:
-    """Return the row of a registered model. Those that tell when they are made, such as a server's, have dashes."""
-    from wiw.world_models.base import Accepts
+    """Return the row of a registered model, with dashes for what is known only once it is built."""
+    from wiw.world_models.base import find_accepts
     from wiw.world_models.status import lacks
 
     dashes = (name, *"-" * (len(HEADS) - 1))
@@ -71,11 +71,11 @@ def _make_row(name: str) -> _Row:
         model = WORLD_MODELS.find(name)
     except Exception as error:  # a broken plugin must not hide the others
         return _Row(dashes, status=str(error), style="red")
-    declared, requires = getattr(model, "accepts", None), getattr(model, "requires", None)
+    declared, requires = find_accepts(model), getattr(model, "requires", None)
     lacking = lacks(requires) if requires else []
     status = f"needs {', '.join(lacking)}" if lacking else "ready"
     style = "yellow" if lacking else "green"
-    if not isinstance(declared, Accepts):
+    if declared is None:
         return _Row(dashes, status=status, style=style)
     height, width = declared.size
     takes = " + ".join((declared.view, *declared.needs))

@@ -109,7 +109,7 @@ FIRST_LOOKS = (HIDDEN_LOOK, SMALL_LOOK, AVERTED_LOOK)
 FRONTLESS = ("bin", "floor lamp", "laundry basket", "plant", "stool", "table lamp")
 """Categories that look alike from all sides."""
 
-LABELS_NEEDED = "put the files with its labels beside its mesh (docs/real-scans.md)"
+LABELS_NEEDED = "put the files with its labels next to its mesh (docs/real-scans.md)"
 HIDDEN = (0.4, 0.2)
 """Visible shares at the start below which an episode is of difficulty 1 and 2."""
 
@@ -119,10 +119,10 @@ class EpisodeRules:
     """Rules that a target and a start of an episode satisfy. Lengths in metres, sizes in steradians."""
 
     nearest: float = 0.7
-    """Least horizontal distance from the start to the target's centre."""
+    """Minimum horizontal distance from the start to the target's centre."""
     farthest: float = 5.0
     seen: float = 0.0025
-    """Least size of what is seen of the target at the start: 75 pixels of the panorama at eye level."""
+    """Minimum size of what is seen of the target at the start: 75 pixels of the panorama at eye level."""
     hidden: float = HIDDEN[0]
     """Heavily occluded: at most this share of the target is visible ..."""
     small: float = 0.25
@@ -130,15 +130,15 @@ class EpisodeRules:
     tiny: float = 0.008
     """... and is no larger than this, 5 degrees across."""
     clear: float = 0.7
-    """Least visible share in the best view."""
+    """Minimum visible share in the best view."""
     large: float = 0.02
-    """Least size of the best view: 8 degrees across ..."""
+    """Minimum size of the best view: 8 degrees across ..."""
     enough: float = 0.3
     """... and the size above which it gets no better: 31 degrees across."""
     gain: float = 2.5
     """How much larger than at the start the target must be seen there, at least."""
     budget: int = 8
-    """Most primitives from the start to the best view; the paper's 10 decisions leave 9 to carry out."""
+    """Maximum number of primitives from the start to the best view; the paper's 10 decisions leave 9 to carry out."""
     turned: float = 67.5
     """Most degrees between the start's heading and the target."""
     survey: int = 250
@@ -180,11 +180,11 @@ def centre_of(world: World, instance: int, where: str) -> NDArray[np.float64]:
     """
     things = world.scene.instances
     if not 1 <= instance <= len(things):
-        raise ArgumentError(f"{where}: target {instance} is no instance of {world.name}, which has 1 to {len(things)}")
-    if world.scene.attributes.get("labels") == "none":
         raise ArgumentError(
-            f"{where}: {world.name} has no labels, so that target {instance} is unknown; {LABELS_NEEDED}"
+            f"{where}: target {instance} is not an instance of {world.name}, which has 1 to {len(things)}"
         )
+    if world.scene.attributes.get("labels") == "none":
+        raise ArgumentError(f"{where}: {world.name} has no labels, so target {instance} is unknown; {LABELS_NEEDED}")
     if not things[instance - 1]["triangle_count"]:
         raise ArgumentError(f"{where}: target {instance} has no surface in {world.name}")
     return np.asarray(things[instance - 1]["bounds"], np.float64).mean(axis=0)
@@ -206,7 +206,7 @@ def generate(
     Otherwise the episodes are a function of (scene, seed, `first`).
 
     Raises:
-        ArgumentError: the scene holds nothing of `categories`, or too few targets and starts satisfy `rules`.
+        ArgumentError: the scene has no object of `categories`, or too few targets and starts satisfy `rules`.
     """
     key = core.fold_key([seed, first, 0xA12])
     things = _targets(world, categories)
@@ -226,7 +226,7 @@ def generate(
             if len(made) == count:
                 return [_number_episode(episode, first + i) for i, episode in enumerate(made)]
     raise ArgumentError(
-        f"{world.name}: only {len(made)} of {count} targets and starts satisfy {rules}; ask for fewer in a scene"
+        f"{world.name}: only {len(made)} of {count} targets and starts satisfy {rules}; request fewer per scene"
     )
 
 
@@ -243,8 +243,9 @@ def _targets(world: World, categories: Sequence[str]) -> dict[str, list[Mapping[
             things.setdefault(category_of(instance), []).append(instance)
     if not things:
         raise ArgumentError(
-            f"{world.name}: holds nothing of the categories {', '.join(categories)}; it has "
-            f"{', '.join(sorted(world.scene.categories)) or 'none at all'}: name those wanted (categories=[...])"
+            f"{world.name}: has no object of the categories {', '.join(categories)}; it has "
+            f"{', '.join(sorted(world.scene.categories)) or 'none at all'}: choose the categories to use "
+            "(categories=[...])"
         )
     return things
 
@@ -317,7 +318,7 @@ def _episode(
 
 
 def _find_reason(size: float, share: float, averted: bool, best: _View, rules: EpisodeRules) -> str | None:
-    """Return why a first look is hard where the best view mends it; None where it is not, or where that does not."""
+    """Return why the first view is hard where the best view resolves it; None if it is not, or where that does not."""
     if averted:
         return AVERTED_LOOK
     if best.size < rules.gain * size:
@@ -330,7 +331,7 @@ def _find_reason(size: float, share: float, averted: bool, best: _View, rules: E
 def find_front(world: World, instance: Mapping[str, Any]) -> NDArray[np.float64] | None:
     """Return the horizontal direction that an instance faces, float64 [3] of unit length.
 
-    None where it is not known: in scenes other than the generated apartments, whose furniture is built to face its own
+    None if it is not known: in scenes other than the generated apartments, whose furniture is built to face its own
     +z, and of things that look alike from all sides.
     """
     if "layout" not in world.scene.attributes or category_of(instance) in FRONTLESS:
@@ -505,8 +506,8 @@ def load(
     for i, episode in enumerate(found):
         if episode.info["category"] not in named:
             raise FileError(
-                f"{path}: episode {i}: info.category '{episode.info['category']}' is none of the categories "
-                f"{', '.join(named)}; correct the file, or name it too (categories=[...])"
+                f"{path}: episode {i}: info.category '{episode.info['category']}' is not among the categories "
+                f"{', '.join(named)}; correct the file, or add it (categories=[...])"
             )
     return found, tuple(named)
 
@@ -526,4 +527,4 @@ def _check_fields(episode: Episode, where: str) -> None:
     if isinstance(target, bool) or not isinstance(target, int) or target < 1:
         raise FileError(f"{where}: info.target: expected the id of an instance (1, 2, ...), got {target!r}")
     if not isinstance(category, str) or not category:
-        raise FileError(f"{where}: info.category: expected what the target is, got {category!r}")
+        raise FileError(f"{where}: info.category: expected the target's category, got {category!r}")

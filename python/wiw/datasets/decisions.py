@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
 """Stored decisions: plans from one place, what each would truly lead to, and a goal that one of them serves best.
 
-A Parquet file: a row a plan, a row group a decision, with observation and goal in the first row of each. World models
-are compared on it without a simulator: which plan do their imagined ends choose, and what does the choice cost?
+A Parquet file with one row per plan and one row group per decision, whose first row has observation and goal. World
+models are compared on it without a simulator: which plan do their imagined ends choose, and what does that cost?
 """
 
 from __future__ import annotations

@@ -60,7 +60,7 @@ class Demonstration:
     encoded_depths: tuple[bytes, ...] | None = None
     """T depths of the front view, 16-bit PNG."""
     encoded_wrist_images: tuple[bytes, ...] | None = None
-    """T views of the wrist camera, JPEG or PNG; None where none were collected."""
+    """T views of the wrist camera, JPEG or PNG; None if none were collected."""
     encoded_wrist_depths: tuple[bytes, ...] | None = None
     """T depths of the wrist camera's view, 16-bit PNG."""
     wrist_poses: NDArray[np.float64] | None = None
@@ -88,7 +88,7 @@ class Demonstration:
 
     @cached_property
     def depths(self) -> NDArray[np.float32] | None:
-        """float32 [T, H, W]: their planar depths in metres, 0 where nothing is hit; None where none were collected.
+        """float32 [T, H, W]: their planar depths in metres, 0 where nothing is hit; None if none were collected.
 
         Raises:
             FileError: one of them is damaged.
@@ -115,7 +115,7 @@ def decode_depths(pictures: Sequence[bytes]) -> NDArray[np.float32]:
 
 
 def decode_pictures(pictures: Sequence[bytes], how: int) -> NDArray[Any]:
-    """[T, H, W, ...]; what is damaged is no picture, or one of another size."""
+    """[T, H, W, ...]; what is damaged is not a picture, or one of another size."""
     try:
         images = [cv2.imdecode(np.frombuffer(data, np.uint8), how) if data else None for data in pictures]
         whole = [image for image in images if image is not None]
@@ -124,7 +124,8 @@ def decode_pictures(pictures: Sequence[bytes], how: int) -> NDArray[Any]:
         return np.stack(whole)
     except (ValueError, cv2.error) as error:
         raise FileError(
-            f"a picture of a demonstration is damaged ({error}); delete its file, then `wiw collect` makes it anew"
+            f"a picture of a demonstration is damaged ({error}); delete its file and repeat `wiw collect` to recreate "
+            "it"
         ) from error
 
 

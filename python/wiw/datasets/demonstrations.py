@@ -52,7 +52,7 @@ class Demonstrations(Sequence[Demonstration]):
     Args:
         folder: with the manifest.
         tasks: "all", or names of those to read.
-        partial: whether to read what there is of a collection that has not come to its end.
+        partial: whether to read what exists of an unfinished collection.
 
     Raises:
         DependencyError: pyarrow is not installed.
@@ -107,7 +107,7 @@ class Demonstrations(Sequence[Demonstration]):
 
     @property
     def failed(self) -> dict[str, int]:
-        """Tables that experts failed at, by task; another one was set in the place of each, unless they were kept."""
+        """Tables that experts failed at, by task; each was replaced by another one, unless they were kept."""
         counts = dict.fromkeys(self.config["tasks"], 0)
         for shard in self.files:
             counts[shard.facts["task"]] += shard.facts["failed"]
@@ -127,7 +127,7 @@ class Demonstrations(Sequence[Demonstration]):
 
     @property
     def wrist_intrinsics(self) -> NDArray[np.float64] | None:
-        """Intrinsics float64 [3, 3] of the wrist camera, as in `FrontCamera`; None where its views were not collected.
+        """Intrinsics float64 [3, 3] of the wrist camera, as in `FrontCamera`; None if its views were not collected.
 
         Raises:
             FileError: nothing has been collected yet.
@@ -149,7 +149,7 @@ def read_manifest(folder: Path) -> dict[str, Any]:
     """Return the settings with which a folder was collected.
 
     Raises:
-        FileError: there is no manifest, or none that can be read.
+        FileError: the manifest does not exist or cannot be read.
     """
     path = folder / MANIFEST
     found = read_json_object(path, "a manifest of `wiw collect`, in a folder that it has written")

@@ -21,7 +21,7 @@ from wiw.types import Episode
 
 VERSION = 1
 MOST_BYTES = 256 << 20
-"""Most bytes of an episode file, unpacked; 100,000 episodes take about 50 MB."""
+"""Maximum size of an episode file in bytes, unpacked; 100,000 episodes take about 50 MB."""
 
 
 def save(path: str | Path, episodes: Sequence[Episode], task: str, **about: Any) -> None:
@@ -102,7 +102,7 @@ def read_json(path: str | Path) -> Any:
             raw = file.read(MOST_BYTES + 1)
         if len(raw) > MOST_BYTES:
             raise ValueError(
-                f"expected an episode file of at most {MOST_BYTES} bytes when unpacked, and it holds more; split it"
+                f"expected an episode file of at most {MOST_BYTES} bytes when unpacked, but it is larger; split it"
             )
         return parse_json(raw)
     except (OSError, EOFError, ValueError, zlib.error) as error:
@@ -142,4 +142,4 @@ _FIELDS: Mapping[str, Callable[[Any, str], Any]] = {
     "geodesic": _length,
 }
 _INFO: Mapping[str, Callable[[Any, str], Any]] = {"ideal_primitives": integer, "radius": number, "best_position": point}
-"""What tasks compute with."""
+"""Fields that tasks compute with."""

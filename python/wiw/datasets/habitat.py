@@ -21,7 +21,7 @@ Order = Literal["xyzw", "wxyz"]
 PUBLISHED = "world-in-world"
 """Source of episodes that the paper's authors have published, as `Episode.info` names it."""
 _UNREADABLE = (LookupError, TypeError, ValueError, ArithmeticError, AttributeError)
-"""What an item of another shape raises."""
+"""Exceptions raised for an item of another shape."""
 
 
 def yaw_of(quaternion: Sequence[float], order: Order, where: str) -> float:
@@ -47,7 +47,7 @@ def is_habitat(body: Any) -> bool:
 
 
 def _first(body: Any, name: str) -> Mapping[str, Any]:
-    """Return the first object of a list in a parsed file; an empty one where there is no such list."""
+    """Return the first object of a list in a parsed file; an empty one if there is no such list."""
     items = body.get(name) if isinstance(body, Mapping) else None
     return items[0] if isinstance(items, list) and items and isinstance(items[0], Mapping) else {}
 
@@ -139,7 +139,7 @@ def _world_in_world(item: Mapping[str, Any], where: str, folder: Path) -> Episod
 
 
 def _find_picture(folder: Path, relative: str) -> str | None:
-    """Return the whole path of a picture within a folder; None where it is not there."""
+    """Return the whole path of a picture within a folder; None if it does not exist."""
     path = (folder / relative).resolve()
     return str(path) if path.is_relative_to(folder.resolve()) and path.is_file() else None
 
@@ -153,7 +153,7 @@ def read_active_recognition(body: Mapping[str, Any], path: str) -> list[Episode]
     """Read episodes of the published AR file (`start_rotation` in order wxyz, the category's key misspelt).
 
     Scene paths are those of the authors' disk, so that only folder and file name are kept, relative to the scene
-    folder. The place of a target is known by its instance alone; until the scene tells, the goal's position is NaN.
+    folder. The place of a target is known by its instance alone; until the scene is open, the goal's position is NaN.
     """
     return [_active_recognition(item, f"{path}: episode {i}") for i, item in enumerate(body["episodes"])]
 

@@ -50,7 +50,7 @@ class Tier:
 TIERS: Mapping[str, Tier] = {
     "near": Tier(2.0, 5.0, 42, "goals 2 to 5 m away, out of sight"),
     "far": Tier(5.0, 8.0, 48, "goals 5 to 8 m away, out of sight"),
-    "beyond": Tier(3.0, 7.0, 42, "goals 3 to 7 m away, one corner beyond what the start sees, where the way forks"),
+    "beyond": Tier(3.0, 7.0, 42, "goals 3 to 7 m away, one corner beyond the view from the start, where the way forks"),
 }
 
 
@@ -59,14 +59,14 @@ class EpisodeRules:
     """Rules that a start and a goal of an episode satisfy. Lengths in metres."""
 
     shortest: float = 2.0
-    """Least geodesic distance."""
+    """Minimum geodesic distance."""
     longest: float = 8.0
     budget: int = 42
-    """Most primitives an ideal run may need: 70 % of the paper's 20 decisions of 3 primitives."""
+    """Maximum number of primitives an ideal run may need: 70 % of the paper's 20 decisions of 3 primitives."""
     goal_depth: float = 1.2
-    """Least median depth of the goal view, so that it shows more than a wall."""
+    """Minimum median depth of the goal view, so that it shows more than a wall."""
     goal_instances: int = 4
-    """Least number of things in the goal view, the outside counted. In a scene of fewer, such as a scan that is one
+    """Minimum number of things in the goal view, the outside counted. In a scene of fewer, such as a scan that is one
     mesh, nothing is asked of their number."""
     attempts: int = 400
     """Pairs tried per episode before giving up; ten times as many within a tier."""
@@ -79,13 +79,13 @@ class EpisodeRules:
         ]
         if self.tier != "any" and given:
             raise ArgumentError(
-                f"imagenav: tier '{self.tier}' sets shortest, longest and budget; expected none of them beside it, got "
-                f"{', '.join(given)}. Leave that out, or the tier"
+                f"imagenav: tier '{self.tier}' sets shortest, longest and budget; expected none of these in addition, "
+                f"got {', '.join(given)}. Leave these out, or the tier"
             )
 
     @property
     def tiers(self) -> tuple[str, ...]:
-        """Tiers that episodes are of, in turn; empty where they are of none."""
+        """Tiers that episodes are of, in turn; empty if they are of none."""
         return {"any": (), "all": tuple(TIERS)}.get(self.tier, (self.tier,))
 
 
@@ -185,12 +185,12 @@ def _explain_failure(world: World, rules: EpisodeRules, tier: str, broken: Count
     loosen = (
         f"Choose a larger scene, another tier, or {more}"
         if tier
-        else f"Loosen one (--task-option goal_depth=0.8, or goal_depth=0.8 in Python), or give {more}"
+        else f"Loosen one (--task-option goal_depth=0.8, or goal_depth=0.8 in Python), or allow {more}"
     )
     numbers = ", ".join(f"{name}={getattr(rules, name):g}" for name in NUMBERS)
     return EpisodesError(
-        f"{world.name}: {asked}no start and goal among {rules.attempts} satisfy {numbers}: {reasons}. What got "
-        f"furthest broke {rule}. {loosen}",
+        f"{world.name}: {asked}no start and goal among {rules.attempts} satisfy {numbers}: {reasons}. The rule that "
+        f"the best attempts broke: {rule}. {loosen}",
         rule,
     )
 

@@ -109,7 +109,7 @@ class NavigationData(Sequence[NavigationSegment]):
 
 
 class Clips(Sequence[NavigationSegment]):
-    """Windows of one length, in order; each is read when it is asked for."""
+    """Windows of one length, in order; each is read when it is requested."""
 
     def __init__(self, data: NavigationData, length: int, stride: int = 1) -> None:
         if length < 1 or stride < 1:
@@ -120,7 +120,7 @@ class Clips(Sequence[NavigationSegment]):
         if not len(self):
             longest = max((row["frames"] for row in data.segments), default=0)
             raise ArgumentError(
-                f"{data.folder}: no segment has {length} frames, the longest has {longest}; ask for shorter clips"
+                f"{data.folder}: no segment has {length} frames, the longest has {longest}; use shorter clips"
             )
 
     def __len__(self) -> int:
@@ -196,8 +196,7 @@ def read_meta(folder: Path) -> dict[str, Any]:
     path = folder / META
     if not path.exists() and (folder / MANIFEST).exists():
         raise FileError(
-            f"{path} is missing; `wiw collect navigation` writes it at its end: repeat `wiw collect navigation` until "
-            "it is finished"
+            f"{path} is missing; `wiw collect navigation` writes it at the end: repeat that command until it finishes"
         )
     found = read_json_object(path, "the description of a navigation dataset, which `wiw collect navigation` writes")
     if not isinstance(found.get("files"), dict):
@@ -231,13 +230,13 @@ def write_meta(folder: Path, meta: Mapping[str, Any]) -> None:
 
 
 def read_navigation_manifest(folder: Path) -> dict[str, Any]:
-    """Return the settings with which a folder was begun.
+    """Return the settings with which a folder was started.
 
     Raises:
         FileError: there is no manifest, or it is not one of a navigation dataset.
     """
     path = folder / MANIFEST
-    found = read_json_object(path, "a new folder, or one that `wiw collect navigation` has begun")
+    found = read_json_object(path, "a new folder, or one that `wiw collect navigation` has started")
     if found.get("what") != "navigation":
         raise FileError(f"{path}: expected a manifest of `wiw collect navigation`, got one of {found.get('what')}")
     return found

@@ -53,10 +53,10 @@ class Verification:
         self.problems.setdefault(kind, []).append(message)
 
     def __str__(self) -> str:
-        counts = f"{self.files} files, {self.segments:,} segments, {self.frames:,} frames, {self.pictures:,} pictures"
+        counts = f"{self.files} files, {self.segments:,} segments, {self.frames:,} frames, {self.pictures:,} images"
         lines = [f"{counts} checked"]
         if self.duplicates:
-            lines.append(f"{self.duplicates} pictures equal one from another position of their scene")
+            lines.append(f"{self.duplicates} images equal one from another position in the same scene")
         for kind, messages in self.problems.items():
             lines += [f"{kind}: {message}" for message in messages[:LISTED_PROBLEMS]]
             if len(messages) > LISTED_PROBLEMS:
@@ -72,12 +72,12 @@ def verify_datasets(
 
     Args:
         folders: of the datasets.
-        pictures: whether every picture is decoded, and compared with all others; it takes most of the time.
+        pictures: whether to decode every image and compare it with all others, which takes most of the time.
         progress: called after each file of frames.
 
     Raises:
         DependencyError: pyarrow is not installed.
-        FileError: a folder is no finished dataset.
+        FileError: a folder is not a finished dataset.
     """
     found, datasets = Verification(), [NavigationData(folder) for folder in folders]
     total = sum(len(_frame_files(data)) for data in datasets)
@@ -106,10 +106,13 @@ def _check_files(data: NavigationData, found: Verification) -> None:
         try:
             digest = hash_file(path)
         except OSError as error:
-            found.add("file", f"{path}: {error.strerror}; `wiw collect`, asked for the same again, makes it anew")
+            found.add("file", f"{path}: {error.strerror}; repeat the `wiw collect` command to recreate it")
             continue
         if digest != expected["sha256"]:
-            found.add("file", f"{path}: its SHA-256 is not that of {META}; delete it, and `wiw collect` makes it anew")
+            found.add(
+                "file",
+                f"{path}: its SHA-256 differs from {META}; delete it and repeat `wiw collect` to recreate it",
+            )
     listed = {data.folder / name for name in data.meta["files"]}
     for path in sorted((data.folder / "data").glob("*")):
         if path not in listed:
@@ -180,7 +183,7 @@ def find_motion_errors(segment: NavigationSegment, camera: Mapping[str, Any]) ->
     if (segment.sources > frames).any() or (segment.sources[segment.sources] != segment.sources).any():
         yield "expected each source to be an earlier frame with a picture"
     elif [data is not None for data in segment.encoded_images] != (segment.sources == frames).tolist():
-        yield "expected a picture in each frame that is its own source, and in no other"
+        yield "expected an image in each frame that is its own source, and in no other"
     elif camera["projection"] == "equirectangular":
         columns = _wrap(yaws - yaws[segment.sources]) / (2 * np.pi) * camera["size"][1]
         off = (columns - segment.rolls + camera["size"][1] / 2) % camera["size"][1] - camera["size"][1] / 2
@@ -196,7 +199,7 @@ def _wrap(angles: np.ndarray[Any, Any]) -> np.ndarray[Any, Any]:
 def _check_pictures(
     data: NavigationData, segment: NavigationSegment, where: str, found: Verification, seen: _Pictures
 ) -> None:
-    """Decode the pictures of a segment, check their size, and remember them."""
+    """Decode the images of a segment, check their size, and remember them."""
     size = tuple(data.meta["camera"]["size"])
     for frame, encoded in enumerate(segment.encoded_images):
         if encoded is None:
@@ -209,11 +212,11 @@ def _check_pictures(
             found.add("picture", f"{where}: {error}")
             continue
         if shapes != {size}:
-            found.add("picture", f"{where}, frame {frame}: expected pictures of {size}, got {sorted(shapes)}")
+            found.add("picture", f"{where}, frame {frame}: expected images of {size}, got {sorted(shapes)}")
 
 
 class _Pictures:
-    """Fingerprints of all pictures, with where each was first seen from."""
+    """Fingerprints of all images, with the place where each was first seen."""
 
     def __init__(self) -> None:
         self._first: dict[bytes, tuple[str, str, bytes]] = {}
@@ -233,5 +236,5 @@ class _Pictures:
         """Add duplicates: within a scene as a number, between scenes and datasets as leaks."""
         found.duplicates = self._duplicates
         for (folder, scene, other_folder, other_scene), count in self._shared.items():
-            pictures = "1 picture is" if count == 1 else f"{count} pictures are"
+            pictures = "1 image is" if count == 1 else f"{count} images are"
             found.add("leak", f"{pictures} in {scene} of {folder} and in {other_scene} of {other_folder}")

@@ -1,5 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Files of the navigation dataset: Parquet, a row a frame, a row group a segment (`docs/collecting-navigation.md`)."""
+"""Parquet files of the navigation dataset: one row per frame, one row group per segment.
+
+`docs/collecting-navigation.md` describes the columns.
+"""
 
 from __future__ import annotations
 
@@ -127,7 +130,7 @@ class FrameFile(RowGroupFile):
     """A file of frames that is read segment by segment.
 
     Raises:
-        FileError: it is not there, is damaged, or is none of ours.
+        FileError: it does not exist, is damaged, or was not written by wiw.
     """
 
     def __init__(self, path: Path) -> None:

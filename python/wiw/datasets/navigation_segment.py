@@ -53,9 +53,9 @@ class NavigationSegment:
     rolls: NDArray[np.int32]
     """int32 [T]: columns to roll it by, to the right."""
     encoded_images: tuple[bytes | None, ...]
-    """T pictures, JPEG or lossless WebP; None where `sources` names another frame."""
+    """T pictures, JPEG or lossless WebP; None if `sources` names another frame."""
     encoded_depths: tuple[bytes | None, ...] | None
-    """T depths, 16-bit PNG in millimetres, likewise; None where none were collected."""
+    """T depths, 16-bit PNG in millimetres, likewise; None if none were collected."""
 
     def __len__(self) -> int:
         return len(self.actions)
@@ -71,7 +71,7 @@ class NavigationSegment:
 
     @cached_property
     def depths(self) -> NDArray[np.float32] | None:
-        """float32 [T, H, W]: metres, 0 where nothing is hit; None where none were collected.
+        """float32 [T, H, W]: metres, 0 where nothing is hit; None if none were collected.
 
         Along the ray for panoramas, planar for perspective views.
 
@@ -83,7 +83,7 @@ class NavigationSegment:
         return self._show(self.encoded_depths, cv2.IMREAD_UNCHANGED).astype(np.float32) / np.float32(DEPTH_UNITS)
 
     def clip(self, start: int, length: int) -> NavigationSegment:
-        """Return `length` frames from frame `start` as a segment of its own, whose first action is Null.
+        """Return `length` frames from frame `start` as a separate segment, whose first action is Null.
 
         Raises:
             ArgumentError: the segment does not have these frames.
@@ -126,7 +126,7 @@ class NavigationSegment:
     def _show(self, pictures: Sequence[bytes | None], how: int) -> NDArray[Any]:
         decoded = {int(source): self._decode(pictures, int(source), how) for source in np.unique(self.sources)}
         if len({image.shape for image in decoded.values()}) > 1:
-            raise FileError(f"{self._name}: expected pictures of one size, got several; {_REMEDY}")
+            raise FileError(f"{self._name}: expected images of one size, got several; {_REMEDY}")
         return np.stack(
             [np.roll(decoded[int(i)], int(roll), axis=1) for i, roll in zip(self.sources, self.rolls, strict=True)]
         )
@@ -140,7 +140,7 @@ class NavigationSegment:
             except cv2.error:
                 image = None
         if image is None:
-            raise FileError(f"{self._name}: expected a picture in frame {frame}, got something else; {_REMEDY}")
+            raise FileError(f"{self._name}: expected an image in frame {frame}, got something else; {_REMEDY}")
         return image
 
     @property
@@ -148,7 +148,7 @@ class NavigationSegment:
         return f"{self.scene}, segment {self.segment}"
 
 
-_REMEDY = "`wiw data verify` finds the damaged file; delete it, then `wiw collect` makes it anew"
+_REMEDY = "`wiw data verify` finds the damaged file; delete it and repeat `wiw collect` to recreate it"
 
 
 def encode_color(image: NDArray[np.uint8], lossless: bool) -> bytes:
@@ -162,7 +162,7 @@ def encode_color(image: NDArray[np.uint8], lossless: bool) -> bytes:
 
 
 def encode_millimetres(depth: NDArray[np.float32]) -> bytes:
-    """Encode metres float32 [H, W] as a 16-bit PNG in millimetres; 65.535 m stands for all that is further away."""
+    """Encode metres float32 [H, W] as a 16-bit PNG in millimetres; 65.535 m stands for anything farther away."""
     return encode_units(np.clip(np.rint(depth * DEPTH_UNITS), 0, np.iinfo(np.uint16).max).astype(np.uint16))
 
 

@@ -13,7 +13,7 @@ from wiw.errors import DependencyError, FileError
 from wiw.files import atomic_file
 
 MANIFEST = "manifest.json"
-"""Name of the file in a folder that says what was asked for."""
+"""Name of the file in a folder that says what was requested."""
 KEY = b"wiw"
 """Key of the Parquet metadata, which are JSON."""
 
@@ -46,7 +46,7 @@ def image_values(pictures: Sequence[bytes | None]) -> list[dict[str, Any] | None
 
 
 def build_schema(types: Mapping[str, Any], facts: Mapping[str, Any]) -> Any:
-    """Return an Arrow schema whose metadata hold `facts` and tell `datasets` how to decode each column."""
+    """Return an Arrow schema whose metadata hold `facts` and say how `datasets` decodes each column."""
     import pyarrow as pa
 
     features = {"info": {"features": {name: _feature(kind) for name, kind in types.items()}}}
@@ -104,7 +104,7 @@ class RowGroupFile:
         what: what is in it, for messages.
 
     Raises:
-        FileError: it is not there, is damaged, or is of another format.
+        FileError: it does not exist, is damaged, or is of another format.
     """
 
     def __init__(self, path: Path, form: int, what: str) -> None:
@@ -115,7 +115,7 @@ class RowGroupFile:
             self._metadata = parquet.read_metadata(path)
             self.facts: dict[str, Any] = json.loads(self._metadata.metadata[KEY])
         except FileNotFoundError as error:
-            raise FileError(f"{path} is missing; make it with `wiw collect`, asked for the same again") from error
+            raise FileError(f"{path} is missing; recreate it by repeating the `wiw collect` command") from error
         except (OSError, ArrowException, KeyError, TypeError, ValueError) as error:
             raise self.build_damage_error(error) from error
         if self.facts.get("format") != form:
@@ -123,11 +123,6 @@ class RowGroupFile:
 
     def __len__(self) -> int:
         return int(self._metadata.num_row_groups)
-
-    @property
-    def row_counts(self) -> list[int]:
-        """Rows of each row group."""
-        return [self._metadata.row_group(index).num_rows for index in range(len(self))]
 
     def read(self, index: int, columns: Sequence[str] | None = None) -> Any:
         """Return a row group as an Arrow table; nothing else of the file is read.
@@ -144,8 +139,8 @@ class RowGroupFile:
             raise self.build_damage_error(error) from error
 
     def build_damage_error(self, error: Exception) -> FileError:
-        """Return the error that tells what to do about a damaged file."""
+        """Return an error that says what to do about a damaged file."""
         return FileError(
-            f"{self.path}: expected a whole file of {self._what}, got a damaged one ({error}); delete it, then "
-            "`wiw collect`, asked for the same again, makes it anew"
+            f"{self.path}: expected a complete file of {self._what}, got a damaged one ({error}); delete it and "
+            "recreate it by repeating the `wiw collect` command"
         )

@@ -19,9 +19,9 @@ PLACES = 64
 STOREY = 1.0
 """Metres by which floor lies at least below a roof."""
 COVERED = 0.25
-"""Least share of a roof that has floor of another island below it; furniture and walls take much of the rest."""
+"""Minimum share of a roof that has floor of another island below it; furniture and walls take much of the rest."""
 OPEN = 0.5
-"""Least share of a roof that has nothing above it."""
+"""Minimum share of a roof that has nothing above it."""
 EYE = 0.5
 """Metres above the surface from which to look up."""
 UPWARD = (16, 8)
@@ -58,13 +58,13 @@ def _has_floor_below(places: NDArray[np.float64], triangles: NDArray[np.float64]
     found = np.zeros(len(places), bool)
     for number, place in enumerate(places):
         point = place[[0, 2]]
-        sides = np.stack([_cross(q - p, point - p) for p, q in ((a, b), (b, c), (c, a))])
+        sides = np.stack([_cross_product(q - p, point - p) for p, q in ((a, b), (b, c), (c, a))])
         inside = (sides >= 0).all(axis=0) | (sides <= 0).all(axis=0)
         found[number] = (inside & (lowest < place[1] - STOREY)).any()
     return found
 
 
-def _cross(a: NDArray[np.float64], b: NDArray[np.float64]) -> NDArray[np.float64]:
+def _cross_product(a: NDArray[np.float64], b: NDArray[np.float64]) -> NDArray[np.float64]:
     """Return the cross products of vectors in the plane [N, 2]."""
     return a[..., 0] * b[..., 1] - a[..., 1] * b[..., 0]
 

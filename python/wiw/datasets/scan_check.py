@@ -10,7 +10,7 @@ from pathlib import Path
 from wiw.datasets.worlds import navmesh_file, open_navmesh
 from wiw.errors import Error
 from wiw.scenes import MOST_MISSING, Scene, load
-from wiw.scenes.scans import compare_tables
+from wiw.scenes.scans.formats import compare_tables
 
 
 @dataclass
@@ -53,7 +53,7 @@ def check_scan(file: Path) -> ScanCheck:
         navmesh = open_navmesh(path, scene)
         check.area, check.islands = navmesh.area, len(navmesh.islands)
         if not check.area > 0:
-            check.problems.append("no place can be walked on")
+            check.problems.append("no walkable place")
     except Error as error:
         check.problems.append(str(error).removeprefix(f"{file}: "))
     check.seconds = time.perf_counter() - started
@@ -69,6 +69,6 @@ def _count(scene: Scene, check: ScanCheck) -> None:
     if check.missing > MOST_MISSING:
         check.problems.append(f"{check.missing:.0%} of the surface lacks its texture")
     if scene.attributes.get("labels", "none") == "none":
-        check.remarks.append("no labels: fit for Image-Goal Navigation, not for Active Recognition")
+        check.remarks.append("no labels: usable for Image-Goal Navigation, but not for Active Recognition")
     elif not things:
-        check.problems.append("no object has both surface and a category")
+        check.problems.append("no object has both a surface and a category")

@@ -51,7 +51,7 @@ def find_evaluation_split(spec: str | PathLike[str]) -> str | None:
 
 
 def find_named_split(name: str) -> str | None:
-    """Return the split of a scene that is for evaluation, by its name in a dataset alone; None where none is known."""
+    """Return the split of a scene that is for evaluation, by its name in a dataset alone; None if none is known."""
     if is_generated(name):
         split = strip_edits(name).partition(":")[2].partition("/")[0].partition(":")[0]
         return None if split == "train" else split

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Files of demonstrations: Parquet, a row a frame, a row group a demonstration (`docs/demonstrations.md`)."""
+"""Files of demonstrations: Parquet, a row per frame, a row group per demonstration (`docs/demonstrations.md`)."""
 
 from __future__ import annotations
 
@@ -69,7 +69,7 @@ class Shard(RowGroupFile):
     """A file that is read demonstration by demonstration.
 
     Raises:
-        FileError: it is not there, is damaged, or is none of ours.
+        FileError: it does not exist, is damaged, or was not written by wiw.
     """
 
     def __init__(self, path: Path) -> None:

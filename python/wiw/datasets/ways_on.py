@@ -130,12 +130,12 @@ def _find_nearest(view: FloorView, cells: NDArray[np.bool_], place: NDArray[np.f
 
 
 def find_broken_rule(world: World, start: NDArray[np.float64], goal: NDArray[np.float64]) -> str | None:
-    """Return the first rule of the tier `beyond` that a start and a goal break; None where they break none.
+    """Return the first rule of the tier `beyond` that a start and a goal break; None if they break none.
 
     The goal itself is taken to be out of sight already.
     """
     view = survey_view(world, start)
-    if _sees_around(world, view, goal):
+    if _sees_goal_area(world, view, goal):
         return SEEN_AROUND
     ways = find_ways_on(world, start, view)
     at = _find_nearest(view, view.free, goal)
@@ -145,7 +145,7 @@ def find_broken_rule(world: World, start: NDArray[np.float64], goal: NDArray[np.
     return None if is_in_view(world, _turn_corner(world, view, start, goal), goal) else TWO_CORNERS
 
 
-def _sees_around(world: World, view: FloorView, goal: NDArray[np.float64]) -> bool:
+def _sees_goal_area(world: World, view: FloorView, goal: NDArray[np.float64]) -> bool:
     """Return whether any floor that is a short walk from the goal is in view, or the goal is not on this floor."""
     points = view.list_points(view.free)
     close = np.linalg.norm(points[:, [0, 2]] - goal[[0, 2]], axis=1) <= AROUND

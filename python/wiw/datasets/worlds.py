@@ -34,7 +34,7 @@ class World:
     ground: Ground
     """Heights of the floor; the mesh lies up to 0.2 m above it."""
     backend: Literal["auto", "cpu", "gpu"] = "auto"
-    """As the renderer was asked for."""
+    """The renderer that was requested."""
 
     @cached_property
     def roofs(self) -> frozenset[int]:
@@ -43,7 +43,7 @@ class World:
 
     @cached_property
     def floor(self) -> int:
-        """The largest island of the navigation mesh that is no roof: where episodes take place."""
+        """The largest island of the navigation mesh that is not a roof: where episodes take place."""
         return next((index for index in range(len(self.navmesh.islands)) if index not in self.roofs), 0)
 
 
@@ -92,7 +92,7 @@ def open_navmesh(path: Path | None, scene: Scene) -> NavMesh:
     if (low < scene.bounds[0] - SLACK).any() or (high > scene.bounds[1] + SLACK).any():
         raise FileError(
             f"{path}: its mesh reaches from {low.round(1)} to {high.round(1)}, the scene from "
-            f"{scene.bounds[0].round(1)} to {scene.bounds[1].round(1)} (metres, Y up): expected the mesh of this very "
-            "scene; take the file away to have one built"
+            f"{scene.bounds[0].round(1)} to {scene.bounds[1].round(1)} (metres, Y up): expected the navigation mesh of "
+            "this scene; remove the file to have one built"
         )
     return navmesh

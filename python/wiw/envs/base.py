@@ -20,29 +20,29 @@ class Segment:
     """The outcome of executing one decision's actions."""
 
     observation: Any
-    """The view at its end, such as a `wiw.types.Observation`."""
+    """The observation at its end, such as a `wiw.types.Observation`."""
     executed: NDArray[Any]
-    """The actions carried out: fewer than planned where the episode ended on the way."""
+    """The executed actions: fewer than planned if the episode ended on the way."""
     path: NDArray[np.float64]
     """float64 [len(executed) + 1, 3]: world positions from before the first action to after the last."""
     terminated: bool
     truncated: bool
     key: Key | None = None
-    """Key of the next decision, where the environment counts decisions itself."""
+    """Key of the next decision, if the environment counts decisions itself."""
     refused: tuple[str, ...] = ()
-    """Why actions were not carried out to their ends, one reason for each such action."""
+    """Why actions were not executed to their end, one reason for each such action."""
 
 
 class Guide(ABC):
     """Ground truth about plans from an environment's present state.
 
-    Only the loop passes guides on, to stages that an experiment gives the ground truth; policies and models get none.
+    Only the loop passes on guides, to stages that an experiment gives ground truth; policies and models get none.
     """
 
     @abstractmethod
     def evaluate_plan(self, plan: NDArray[Any]) -> float:
-        """Return how good a plan truly is, the higher the better: the progress at its end, or where it gets all the way
-        before that.
+        """Return the true value of a plan, higher is better: the progress at its end, or at the point where it
+        completes the task.
         """
 
     @abstractmethod
@@ -66,9 +66,9 @@ class Env(ABC):
 
     @abstractmethod
     def run(self, plan: Any, answer: Answer | TextAnswer | None = None) -> Segment:
-        """Carry out the actions of one decision, as far as the episode goes on, and observe once, at the end.
+        """Execute the actions of one decision, as long as the episode continues, and observe once, at the end.
 
-        `answer` is what the agent believes now; the loop gives it only where the goal expects one.
+        `answer` is what the agent believes now; the loop passes it only if the goal expects one.
         """
 
     @property
@@ -83,31 +83,31 @@ class Env(ABC):
 
     @abstractmethod
     def truth(self) -> Truth:
-        """Return where the agent truly is; for records, metrics and reports alone."""
+        """Return where the agent truly is; only for records, metrics and reports."""
 
     @abstractmethod
     def result(self) -> Mapping[str, float]:
         """Return the metrics of the running episode, "success" (0 or 1) among them."""
 
     def details(self) -> Mapping[str, Any]:
-        """Return what is recorded of the running episode besides its metrics, JSON-able."""
+        """Return the JSON-able values recorded of the running episode besides its metrics."""
         return {}
 
     def fork(self) -> Any:
         """Return a copy of the simulator in its present state, which the world model `oracle` simulates ahead."""
-        raise self._lacks("has no simulator to copy, which world model 'oracle' runs ahead", "fork")
+        raise self._lacks("has no simulator to copy, which world model 'oracle' needs", "fork")
 
     def guide(self) -> Guide:
         """Return the ground truth about plans from here, which `wiw blame` gives to stages of the loop."""
-        raise self._lacks("does not tell what plans are truly worth, which `wiw blame` asks", "guide")
+        raise self._lacks("does not provide the true value of plans, which `wiw blame` needs", "guide")
 
     def semantic(self) -> NDArray[np.uint32]:
         """Return the true category of each pixel of the panorama, uint32 [H, W], for `--semantics simulator`."""
-        raise self._lacks("has no true semantics, which `--semantics simulator` asks for", "semantic")
+        raise self._lacks("has no true semantics, which `--semantics simulator` needs", "semantic")
 
     def instances(self) -> tuple[NDArray[np.uint32], Sequence[Mapping[str, Any]]]:
         """Return the true instance of each pixel of the panorama, uint32 [H, W], and the scene's table of them."""
-        raise self._lacks("does not tell which instance each pixel shows", "instances")
+        raise self._lacks("does not provide the instance that each pixel shows", "instances")
 
     def close(self) -> None:
         """Release the resources of the environment."""
@@ -115,16 +115,16 @@ class Env(ABC):
 
     def _lacks(self, what: str, method: str) -> ArgumentError:
         name = type(self).__name__
-        return ArgumentError(f"{name} {what}; use something else, or write `{name}.{method}`")
+        return ArgumentError(f"{name} {what}; use something else, or implement `{name}.{method}`")
 
 
 def read_episode_option(options: Mapping[str, Any] | None) -> Any:
-    """Return the "episode" of gymnasium's reset options; None where it is left open.
+    """Return the "episode" of gymnasium's reset options; None if not given.
 
     Raises:
         ArgumentError: another option.
     """
     given = options or {}
     if unknown := [str(name) for name in given if name != "episode"]:
-        raise ArgumentError(f"reset: unknown option '{unknown[0]}'; the only one is 'episode', its number")
+        raise ArgumentError(f"reset: unknown option '{unknown[0]}'; the only option is 'episode', the episode's number")
     return given.get("episode")

@@ -36,7 +36,9 @@ class NavigationSpec(ABC):
 
     @property
     def limit(self) -> int | None:
-        """Most primitives of an episode, however they are divided over decisions; None where decisions are counted."""
+        """Maximum number of primitives of an episode, however they are divided over decisions; None if decisions are
+        counted.
+        """
         return None
 
     @property
@@ -57,7 +59,7 @@ class NavigationSpec(ABC):
     @property
     @abstractmethod
     def episode_count(self) -> int | None:
-        """How many episodes there are; None where there is no end of them."""
+        """How many episodes there are; None if there is no end of them."""
 
     @property
     def pointing(self) -> Pointing | None:
@@ -69,7 +71,7 @@ class NavigationSpec(ABC):
         """Return an episode by its number."""
 
     def locate(self, place: World, episode: Episode) -> Episode:
-        """Return an episode with everything that only its open scene tells; most tell it beforehand."""
+        """Return an episode with everything that is only known once its scene is open; most have it already."""
         return episode
 
     @abstractmethod
@@ -210,7 +212,7 @@ def count_leading_turns(plan: Any) -> int:
 
 
 def draw_episode(task: NavigationSpec, random: np.random.Generator) -> int:
-    """Return a random episode's number; among the first 64 where there is no end of them."""
+    """Return a random episode's number; among the first 64 if there is no end of them."""
     return int(random.integers(task.episode_count or 64))
 
 
@@ -221,7 +223,7 @@ def wrap_episode(task: NavigationSpec, index: int) -> int:
         ArgumentError: a negative number.
     """
     if index < 0:
-        raise ArgumentError(f"expected an episode's number of at least 0, got {index}")
+        raise ArgumentError(f"expected an episode number of at least 0, got {index}")
     return index % task.episode_count if task.episode_count else index
 
 
@@ -238,7 +240,7 @@ def start_episode(task: NavigationSpec, episode: Episode) -> tuple[Any, EpisodeS
 
 
 def image_names(task: NavigationSpec, depth: bool) -> list[str]:
-    """Return the images that the simulator is asked for, by its names."""
+    """Return the images to request from the simulator, by its names."""
     return ["panorama", "front", *(["depth"] if depth else []), *([] if task.pointing is None else IDS)]
 
 
@@ -246,7 +248,7 @@ def observe_place(task: NavigationSpec, core: Any, state: EpisodeState, depth: b
     """Return what the agent sees from where the simulator stands.
 
     The panorama, and its depth, are drawn now for whoever decides next, and with the episode over only if somebody
-    looks; so is the front view always. Where the task points something out, everything is drawn for its sake.
+    looks; so is the front view always. Where the task has a target, everything is rendered to find its box.
     """
     if task.pointing is not None:
         return make_observation(task, core.observe(image_names(task, depth)), core.odometry, state)
@@ -267,8 +269,8 @@ def make_observation(
 def round_odometry(odometry: NDArray[np.float64]) -> NDArray[np.float64]:
     """Return odometry [..., 3] to a tenth of a millimetre.
 
-    The simulator's positions are float32 in the scene's frame. How differences of such numbers are rounded tells which
-    of some given starts they are relative to; to a tenth of a millimetre they do not.
+    The simulator's positions are float32 in the scene's frame. The rounding of differences of such numbers reveals
+    which of some given starts they are relative to; to a tenth of a millimetre they do not.
     """
     rounded = odometry.copy()
     rounded[..., :2] = np.round(odometry[..., :2], 4) + 0.0  # no negative zeros

@@ -33,7 +33,7 @@ class ManipulationEnv(gymnasium.Env[dict[str, Any], NDArray[np.float64]], Env):
     way that leads into the table or out of reach is gone as far as it is free, and recorded. Success is rewarded by 1.
 
     Observations are dicts: "front" uint8 [size, size, 3]; "pose" float64 [7], "joints" float64 [9] (the Panda's and its
-    fingers') and "held" (1 while the gripper holds something). What is asked for comes on top, by each camera.
+    fingers') and "held" (1 while the gripper holds something). Requested inputs come on top, for each camera.
 
     Args:
         task: whose episodes are run.
@@ -96,7 +96,7 @@ class ManipulationEnv(gymnasium.Env[dict[str, Any], NDArray[np.float64]], Env):
         return self._read_sensors(), info
 
     def step(self, action: ArrayLike) -> tuple[dict[str, Any], float, bool, bool, dict[str, Any]]:
-        """Go to one pose, which is a decision of its own.
+        """Go to one pose, which counts as one decision.
 
         Raises:
             ArgumentError: no finite pose [7] with a gripper from 0 to 1, nor, with `grid`, whole numbers [7]; nothing
@@ -123,7 +123,7 @@ class ManipulationEnv(gymnasium.Env[dict[str, Any], NDArray[np.float64]], Env):
         return self._observe()
 
     def run(self, plan: ArrayLike, answer: Answer | TextAnswer | None = None) -> Segment:
-        """Carry out one decision's poses [K, 7], as far as the episode goes on; observe once, at the end.
+        """Carry out one decision's poses [K, 7], as far as the episode continues; observe once, at the end.
 
         Raises:
             ArgumentError: as `check_poses`; nothing has moved then.
@@ -174,7 +174,7 @@ class ManipulationEnv(gymnasium.Env[dict[str, Any], NDArray[np.float64]], Env):
         return TableGuide(self.task, self.table, self.fork())
 
     def truth(self) -> Truth:
-        """Return where the gripper is, for records and reports alone; no distance leads to what is asked for."""
+        """Return where the gripper is, for records and reports alone; no distance leads to what is requested."""
         return Truth(self.table.bench.pose[:3], 0.0, float("nan"), float("nan"))
 
     def result(self) -> dict[str, float]:

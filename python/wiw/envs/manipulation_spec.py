@@ -42,4 +42,4 @@ class ManipulationSpec(ABC):
 
     @abstractmethod
     def plan_expert(self, table: Table, bench: Workbench) -> NDArray[np.float64]:
-        """Return the remaining poses of an expert that knows the target, float64 [K, 7]; empty where nothing helps."""
+        """Return the remaining poses of an expert that knows the target, float64 [K, 7]; empty if nothing helps."""

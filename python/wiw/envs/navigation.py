@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Navigation episodes as a gymnasium environment, one primitive a step."""
+"""Navigation episodes as a gymnasium environment, one primitive per step."""
 
 from __future__ import annotations
 
@@ -32,11 +32,11 @@ class NavigationEnv(gymnasium.Env[dict[str, Any], int], Env):
 
     Actions are numbered as in `wiw.action`: `env.step(wiw.action.FORWARD)` goes forward.
 
-    Observations are dicts: "panorama" uint8 [576, 1024, 3], "front" uint8 [480, 480, 3] (HFOV 90), "odometry"
-    float64 [3], and "depth" float32 [576, 1024] where asked for. Where the task points something out, its box is drawn
-    on the images, with "panorama_box" and "front_box" float32 [4] (-1 where it is out of sight), and the actions after
-    the primitives are final answers, one for each of `goal.choices`. The reward is 1 on reaching the goal, or for the
-    right answer. Where the agent truly is stays in `truth()`, outside observation and info.
+    Observations are dicts: "panorama" uint8 [576, 1024, 3], "front" uint8 [480, 480, 3] (HFOV 90), "odometry" float64
+    [3], and "depth" float32 [576, 1024] if requested. If the task marks an object, its box is drawn on the images, with
+    "panorama_box" and "front_box" float32 [4] (-1 if it is out of sight), and the actions after the primitives are
+    final answers, one for each of `goal.choices`. The reward is 1 for reaching the goal, or for the right answer. The
+    agent's true position is only in `truth()`, not in observation or info.
     """
 
     metadata = {"render_modes": ["rgb_array"], "render_fps": 4}  # noqa: RUF012 - gymnasium's name and type
@@ -60,12 +60,12 @@ class NavigationEnv(gymnasium.Env[dict[str, Any], int], Env):
     def reset(
         self, *, seed: int | None = None, options: dict[str, Any] | None = None
     ) -> tuple[dict[str, Any], dict[str, Any]]:
-        """Start an episode: `options={"episode": 3}`, or the next one; `seed` draws one at random.
+        """Start an episode: `options={"episode": 3}`, or the next one; `seed` picks one at random.
 
-        `info["key"]` names the decision that is due, for `agent.decide`; every step gives the next one.
+        `info["key"]` identifies the next decision, for `agent.decide`; every step returns a new one.
 
         Raises:
-            ArgumentError: an unknown option, or a negative number of an episode.
+            ArgumentError: an unknown option, or a negative episode number.
         """
         super().reset(seed=seed)
         index = read_episode_option(options)
@@ -78,7 +78,8 @@ class NavigationEnv(gymnasium.Env[dict[str, Any], int], Env):
         return observation.as_dict(), {"key": self._key}
 
     def step(self, action: int) -> tuple[dict[str, Any], float, bool, bool, dict[str, Any]]:
-        """Carry out one primitive of `wiw.action`: 1 forward, 2 left, 3 right, 4 stop; from 5 on: give a final answer.
+        """Execute one primitive of `wiw.action` (1 forward, 2 left, 3 right, 4 stop), or give a final answer (from 5
+        on).
 
         Raises:
             ArgumentError: another number; nothing has moved then.
@@ -98,7 +99,7 @@ class NavigationEnv(gymnasium.Env[dict[str, Any], int], Env):
         return segment.observation.as_dict(), float(self.state.success), segment.terminated, segment.truncated, info
 
     def render(self) -> NDArray[np.uint8]:
-        """Return the front view, as the observation shows it."""
+        """Return the front view, as in the observation."""
         return self.observation.as_dict()["front"]
 
     # -- the loop ------------------------------------------------------------------------------------------------------
@@ -110,24 +111,26 @@ class NavigationEnv(gymnasium.Env[dict[str, Any], int], Env):
         return self._observe()
 
     def run(self, plan: Sequence[int] | NDArray[np.int8], answer: Answer | TextAnswer | None = None) -> Segment:
-        """Carry out one decision's primitives, as far as the episode goes on; observe once, at the end.
+        """Execute one decision's primitives, as long as the episode continues; observe once, at the end.
 
-        Where the goal expects an answer, `answer` comes first, and nothing is carried out after the last one.
+        If the goal expects an answer, `answer` comes first, and nothing is executed after a final one.
 
         Raises:
             ArgumentError: the goal expects an answer and none is given.
         """
         self.state.decisions += 1
         if answer is None and self.goal.expects_answer:
-            raise ArgumentError("run: the goal expects an answer; give the decision's too, run(plan, answer)")
+            raise ArgumentError(
+                "run: the goal expects an answer; pass the decision's answer as well, run(plan, answer)"
+            )
         stays = answer is not None and self.state.record_answer(self.task, answer)
         return self._carry_out([] if stays else self.state.limit_plan(self.task, plan))
 
     def answer(self, text: str) -> dict[str, float]:
-        """End the episode with an answer in words, for those who step it themselves; return its metrics.
+        """End the episode with an answer in words, for callers who step it themselves; return its metrics.
 
         Raises:
-            ArgumentError: the goal is no question, or the text is empty.
+            ArgumentError: the goal is not a question, or the text is empty.
         """
         if not self.goal.question or not text.strip():
             raise ArgumentError(

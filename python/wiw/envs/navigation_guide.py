@@ -31,7 +31,7 @@ class ShortestPath:
         self._field = navmesh.distances_from(on_mesh) if np.isfinite(on_mesh).all() else None
 
     def distances(self, points: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Return the metres from points [N, 3] on, float64 [N]; in a straight line where there is no path."""
+        """Return the metres from points [N, 3] on, float64 [N]; in a straight line if there is no path."""
         straight = np.linalg.norm(points - self.destination, axis=1)
         if self._field is None:
             return straight

@@ -25,7 +25,7 @@ class Pointing:
     part: Literal["all", "largest"] = "all"
     """Whether the box holds all visible pixels or the largest piece of them."""
     lost: Literal["continue", "stop"] = "continue"
-    """Whether the episode goes on where neither panorama nor front view shows the target."""
+    """Whether the episode continues where neither panorama nor front view shows the target."""
 
     def target(self, panorama_ids: NDArray[np.uint32], front_ids: NDArray[np.uint32], instance: int) -> Target:
         """Return the instance as the agent sees it."""

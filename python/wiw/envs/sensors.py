@@ -19,7 +19,7 @@ from wiw.tabletop.workbench import CAMERAS, Workbench
 
 NOTHING: Mapping[str, Any] = MappingProxyType({})
 ROOM, ARM = 0, 255
-"""Ids of what is no object; those are numbered from 1."""
+"""Ids of what is not an object; those are numbered from 1."""
 
 
 @dataclass(frozen=True)
@@ -78,7 +78,7 @@ class Sensors:
         return spaces.Dict(seen)
 
     def pictures(self, bench: Workbench, camera: str = "front") -> dict[str, NDArray[Any]]:
-        """Return the images of one camera: those of "color", "depth" and "instance" that are asked for."""
+        """Return the images of one camera: those of "color", "depth" and "instance" that are requested."""
         return bench.render_view(camera, (self.size, self.size), self.outputs)
 
     def read(

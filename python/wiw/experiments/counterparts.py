@@ -31,7 +31,7 @@ COUNTERPARTS: Mapping[str, Mapping[tuple[str, ...], Counterpart]] = {
 
 
 def find_counterpart(policy: Any, stages: tuple[str, ...]) -> Counterpart | None:
-    """Return a policy's counterpart with ground truth in these stages; None where there is none."""
+    """Return a policy's counterpart with ground truth in these stages; None if there is none."""
     return COUNTERPARTS.get(policy, {}).get(stages) if isinstance(policy, str) else None
 
 

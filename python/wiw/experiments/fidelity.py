@@ -1,12 +1,13 @@
 # SPDX-License-Identifier: Apache-2.0
-"""How true imagination was, decision by decision: every candidate is replayed in the oracle and scored again.
+"""Measure how faithful imagination is, decision by decision: replay every candidate in the oracle and score it again.
 
-Open-loop error of the frames and the order that their scores bring about are two things: a model may blur every picture
-and still tell the better plan. What is found here is written down and reported; no policy or world model sees it.
+The open-loop error of the frames and the ranking that their scores produce are two different things: a model may blur
+every image and still identify the better plan. The results are recorded and reported; no policy or world model sees
+them.
 
-PSNR and SSIM are taken of what the reviser sees, latitude-weighted where that is panoramas. LPIPS knows no sphere and
-needs pixels, so it is taken of perspective views of 90 degrees, 256x256, whatever the reviser sees: the front view of a
-model that imagines no more, else the mean over front, left, right and back.
+PSNR and SSIM are computed on what the reviser sees, latitude-weighted for panoramas. LPIPS is not defined on a sphere
+and needs enough pixels, so it is computed on perspective views of 90 degrees, 256x256, whatever the reviser sees: the
+front view for a model that imagines nothing else, otherwise the mean over front, left, right and back.
 """
 
 from __future__ import annotations
@@ -37,22 +38,22 @@ from wiw.types import Decision, Fidelity, Key, Rollout
 from wiw.world_models.base import WorldModel
 
 PERSPECTIVE = (256, 256)
-"""Size of the views that LPIPS is taken of."""
+"""Size of the views on which LPIPS is computed."""
 _MEASURE = 0x66696465
-"""Keeps the draw whether to measure apart from all others of the decision."""
+"""Separates the draw of whether to measure from all other draws of the decision."""
 
 
 class FidelityObserver(Observer, Privileged):
     """Replays every plan in the simulator and lets the reviser score the true rollouts as well.
 
     Args:
-        lpips: folder of the weights of LPIPS ("auto": `~/.cache/wiw/weights`), to measure fidelity by it as well.
-        share: of the decisions that are measured, above 0 to 1, drawn by their keys: what a smaller share measures, a
-            larger one does too.
-        oracle: which the plans are replayed in; one of the usual size where None.
+        lpips: folder of the weights of LPIPS ("auto": `~/.cache/wiw/weights`), to measure fidelity with it as well.
+        share: share of the decisions to measure, above 0 and up to 1, sampled by their keys: decisions measured with a
+            smaller share are also measured with a larger one.
+        oracle: the oracle in which plans are replayed; None means one of the default size.
 
     Raises:
-        WeightsError: those of LPIPS are not there.
+        WeightsError: those of LPIPS are missing.
         ArgumentError: a share out of range.
     """
 
@@ -64,7 +65,7 @@ class FidelityObserver(Observer, Privileged):
         self._seen: dict[Key, _Truth] = {}
 
     def grant(self, environments: LiveEnvironments) -> None:
-        """Take the environments that plans are replayed in."""
+        """Take the environments in which plans are replayed."""
         self._environments = environments
 
     def watch(self, batch: ScoringBatch) -> None:
@@ -138,7 +139,7 @@ def _copy_memory(situation: Situation) -> Situation:
 
 
 def _view_of(rollout: Rollout, ends: bool, source_size: tuple[int, int] | None) -> FrameSpec:
-    """Return the rollout's own view and size, of panoramas as large as those that its model was asked for."""
+    """Return the rollout's own view and size, of panoramas as large as those requested from its model."""
     return FrameSpec(rollout.view, (rollout.frames.shape[-3], rollout.frames.shape[-2]), ends, source_size)
 
 

@@ -18,13 +18,14 @@ from wiw.policies.base import FrameSpec
 from wiw.types import Key, Rollout
 
 _CONSULT = 0x636F6E73
-"""Keeps the draw whether to consult apart from all others of the decision."""
+"""Separates the draw of whether to consult from all other draws of the decision."""
 
 
 class Gated(ImaginerWrapper):
     """A world model that is consulted for a share of all decisions; for the others the proposer's preference decides.
 
-    Drawn by the decision's key: what a smaller share consults, a larger one does too.
+    The draw depends only on the decision's key: decisions consulted with a smaller share are also consulted with a
+    larger one.
 
     Args:
         model: a world model, or an imaginer.

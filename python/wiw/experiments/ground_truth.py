@@ -1,11 +1,10 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Give stages of the loop the ground truth, to find out which of them causes a failure.
+"""Give ground truth to stages of the loop, to find out which of them causes a failure.
 
-imagination: the oracle stands in for the world model, or for the lack of one.
-scoring: plans are judged by how far the part that is carried out truly gets, and the best one is followed; policies
-still score and remember.
-proposals: the plan of an agent that knows the scene leads the policy's own, as the one that the policy likes best; the
-policy's last one gives way where there would be too many. It still has to be recognised.
+imagination: the oracle stands in for the world model, or for the lack of one. scoring: plans are judged by how far
+their executed part truly gets, and the best one is followed; policies still score and remember. proposals: the plan of
+an agent that knows the scene leads the policy's own, as the one that the policy likes best; the policy's last one gives
+way where there would be too many. It still has to be recognised.
 """
 
 from __future__ import annotations
@@ -41,20 +40,20 @@ class _Guided(PolicyWrapper, Privileged):
     """A policy with access to the environments' guides."""
 
     stage: ClassVar[str]
-    """Which of `STAGES` is given the truth."""
+    """Which of `STAGES` is given ground truth."""
 
     def __init__(self, inner: Policy) -> None:
         super().__init__(inner)
         self._environments = LiveEnvironments()
 
     def grant(self, environments: LiveEnvironments) -> None:
-        """Take the live environments, whose guides know what plans are worth."""
+        """Take the live environments, whose guides know the true value of plans."""
         self._environments = environments
         if isinstance(self.inner, Privileged):
             self.inner.grant(environments)
 
     def describe(self) -> dict[str, Any]:
-        """Describe the wrapped policy, and which stage is given the truth."""
+        """Describe the wrapped policy, and which stage is given ground truth."""
         return {**super().describe(), "ground_truth": self.stage}
 
     def _guide(self, key: Key) -> Any:
@@ -70,16 +69,16 @@ class TruePlans(_Guided):
         """Propose the true plan before the policy's own, at most `candidates` in all."""
         proposals = super().propose(situations, candidates, horizon)
         return [
-            _put_first(self._guide(situation.key).suggest_plan(horizon), plans, candidates)
+            _prepend_plan(self._guide(situation.key).suggest_plan(horizon), plans, candidates)
             for situation, plans in zip(situations, proposals, strict=True)
         ]
 
 
 class TrueScores(_Guided):
-    """A reviser that knows the true progress of each plan, and follows the best.
+    """A reviser that knows the true progress of each plan and follows the best one.
 
     Args:
-        inner: the reviser that scores and remembers as it would without the truth.
+        inner: the reviser, which scores and remembers as it would without ground truth.
         config: of the agent. Plans are judged where the part that is carried out ends: an agent that is drawn by what
             lies beyond it can turn to and fro for ever. None: where the whole plan ends.
     """
@@ -96,7 +95,7 @@ class TrueScores(_Guided):
         proposals: Sequence[Sequence[Proposal]],
         rollouts: Sequence[Sequence[Rollout] | None],
     ) -> list[NDArray[np.float64]]:
-        """Let the wrapped reviser score and remember, and return the true worth of each plan."""
+        """Let the wrapped reviser score and remember, but return the true value of each plan."""
         super().score_or_prefer(situations, proposals, rollouts)
         return [
             self._measure_worths(situation.key, plans) for situation, plans in zip(situations, proposals, strict=True)
@@ -105,7 +104,7 @@ class TrueScores(_Guided):
     def revise(
         self, situation: Situation, proposals: Sequence[Proposal], scores: NDArray[np.float64]
     ) -> tuple[NDArray[Any], int | None]:
-        """Follow the best plan, where the wrapped reviser would write one of its own, too."""
+        """Follow the best plan, even if the wrapped reviser would write its own."""
         super().revise(situation, proposals, scores)
         best = int(np.argmax(scores))
         return proposals[best].actions, best
@@ -119,7 +118,7 @@ class TrueScores(_Guided):
         return length if self._config is None else self._config.count_executed(length)
 
 
-def _put_first(actions: NDArray[Any], plans: Sequence[Proposal], candidates: int) -> list[Proposal]:
+def _prepend_plan(actions: NDArray[Any], plans: Sequence[Proposal], candidates: int) -> list[Proposal]:
     best = Proposal(actions, max(plan.prior for plan in plans), "true")
     others = [plan for plan in plans if not np.array_equal(plan.actions, actions)]
     return [best, *others][:candidates]

@@ -1,9 +1,9 @@
 # SPDX-License-Identifier: Apache-2.0
 """Placebos at equal compute: the world model does as much work, but its rollouts do not depend on the plan.
 
-"shuffled" imagines plans made of the same primitives in another order and shows their futures as the plans' own.
-"swapped" imagines the very plans, but from the first observation of another episode. "blind" asks a model that is told
-plans in words without any. A world model whose score a placebo reaches has helped by something else than foresight.
+"shuffled" imagines plans of the same primitives in another order, and shows their futures as the plans' own. "swapped"
+imagines the actual plans, but from the first observation of another episode. "blind" gives an empty prompt to a model
+that is told plans in words. If a placebo reaches a world model's score, the model's help is not due to foresight.
 """
 
 from __future__ import annotations
@@ -25,9 +25,9 @@ from wiw.types import Key, Proposal
 
 PLACEBOS = ("shuffled", "swapped", "blind")
 DRAWS = 64
-"""Orders that are tried for one that costs as much as the plans themselves."""
+"""Number of orders to try in search of one that costs as much as the plans themselves."""
 _PURPOSE = 0x706C6163
-"""Keeps these draws apart from all others of the decision."""
+"""Separates these draws from all other draws of the decision."""
 
 
 class Placebo(ImaginerWrapper):
@@ -121,7 +121,7 @@ class BlindPlacebo(Placebo):
 
 
 def require_words(control: str) -> None:
-    """Require that a world model is told plans in words, which a blind placebo leaves out.
+    """Check that a world model is told plans in words, which a blind placebo leaves out.
 
     Raises:
         ArgumentError: it is not.
@@ -129,11 +129,11 @@ def require_words(control: str) -> None:
     if control != "text":
         raise ArgumentError(
             "placebo-blind asks a world model with an empty prompt: expected one with control 'text', got "
-            f"'{control}'; placebo-shuffled and placebo-swapped take any"
+            f"'{control}'; placebo-shuffled and placebo-swapped work with any"
         )
 
 
-NO_POSES = "placebo='shuffled' deals primitives anew, and these plans are made of none; use 'swapped'"
+NO_POSES = "placebo='shuffled' reshuffles primitives, but these plans contain none; use 'swapped'"
 
 
 def shuffle(plans: Sequence[Proposal], key: Key, spec: planner.ModelSpec) -> list[Proposal]:

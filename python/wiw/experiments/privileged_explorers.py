@@ -1,10 +1,10 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Explorers that are given truth about a home: which of their errors are perception's, exploration's, or neither's.
+"""Explorers with privileged information about a home, to tell which errors are due to perception, to exploration, or to
+neither.
 
-Two things can be given: perception, which is true labels and colours of real views by the simulator's instance ids, and
-a tour, which is views from all over the home before the first decision. Together with the explorer itself this makes
-four arms of one run. Those that are given something are privileged, and no agents to compare world models with: runs
-record what they are given.
+They can be given two things: perception (true labels and colours of real views, from the simulator's instance ids) and
+a tour (views from all over the home before the first decision). Together with the explorer itself this makes four arms
+of one run. Privileged explorers must not be used to compare world models; runs record what they are given.
 """
 
 from __future__ import annotations
@@ -23,25 +23,25 @@ from wiw.perception.colors import COLORS
 from wiw.perception.oracle_labeller import OracleLabeller
 from wiw.perception.scene_labels import SceneLabels
 from wiw.policies.base import Situation
-from wiw.policies.explorer import Explorer
 from wiw.policies.explorer.drawing import VIEW_SIZE
 from wiw.policies.explorer.memory import Look
+from wiw.policies.explorer.policy import Explorer
 
 SPACING = 1.2
-"""Metres within which a tour passes every place that can be reached."""
+"""Distance in metres within which a tour passes every reachable place."""
 SURVEY = 500
-"""Places that a tour is chosen from."""
+"""Number of places from which a tour is chosen."""
 
 
 class PrivilegedExplorer(Explorer, Privileged):
-    """`Explorer` that is given some truth, as its subclasses say.
+    """`Explorer` with privileged information; subclasses define which.
 
     Args:
-        options: of `Explorer`.
+        options: options of `Explorer`.
     """
 
     true_labels: ClassVar[bool] = False
-    """Whether real views have true labels and colours; imagined views are labelled as ever."""
+    """Whether real views have true labels and colours; imagined views are labelled as usual."""
     tour: ClassVar[bool] = False
     """Whether the map begins with views from all over the home, so that the first answer is final."""
 
@@ -50,7 +50,7 @@ class PrivilegedExplorer(Explorer, Privileged):
         self._environments = LiveEnvironments()
 
     def grant(self, environments: LiveEnvironments) -> None:
-        """Take the environments whose truth is given."""
+        """Take the environments that provide the privileged information."""
         self._environments = environments
 
     def describe(self) -> dict[str, Any]:
@@ -59,7 +59,9 @@ class PrivilegedExplorer(Explorer, Privileged):
         return {**super().describe(), "privileged": [name for name, whether in given if whether]}
 
     def look_around(self, situation: Situation) -> Iterator[Look]:
-        """Yield the looks of a tour, where one is due, and then the real one; with ids where these are given."""
+        """Yield the views of a tour, if one is due, and then the real one; with instance ids if true labels are
+        given.
+        """
         env = self._environments.find(situation.key)
         if self.tour and not situation.memory.grid.visits:
             yield from take_tour(env, self.true_labels)
@@ -67,7 +69,7 @@ class PrivilegedExplorer(Explorer, Privileged):
             yield replace(look, ids=env.instances()[0]) if self.true_labels else look
 
     def perceive(self, situation: Situation, look: Look, pose: NDArray[np.float64]) -> tuple[Views, SceneLabels]:
-        """Return the views and their labels; where ids are given by these, and each thing painted in its colour."""
+        """Return the views and their labels; with instance ids, from these, with each thing painted in its colour."""
         if look.ids is None:
             return super().perceive(situation, look, pose)
         instances = self._environments.find(situation.key).state.world.scene.instances
@@ -96,19 +98,19 @@ def _paint_colors(instances: Sequence[Mapping[str, Any]]) -> NDArray[np.uint8]:
 
 
 class OracleExplorer(PrivilegedExplorer):
-    """Explores for itself with true labels."""
+    """Explores like `Explorer`, but with true labels."""
 
     true_labels = True
 
 
 class TourExplorer(PrivilegedExplorer):
-    """Is led through the whole home, and labels it as `Explorer` does."""
+    """Gets a tour of the whole home, and labels it like `Explorer`."""
 
     tour = True
 
 
 class OracleTourExplorer(PrivilegedExplorer):
-    """Is led through the whole home with true labels: what it gets wrong is the map's or the answerer's error."""
+    """Gets a tour of the whole home with true labels: what it gets wrong is an error of the map or the answering."""
 
     true_labels = tour = True
 

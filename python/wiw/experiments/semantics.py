@@ -18,7 +18,7 @@ from wiw.perception.semantics import Semantics
 from wiw.registry import SEMANTICS
 
 SIMULATOR = "simulator"
-"""The environment's own semantics, which know its scene."""
+"""Name of the environment's own semantics."""
 
 
 def find_source(semantics: Any) -> Semantics | str:
@@ -32,12 +32,14 @@ def find_source(semantics: Any) -> Semantics | str:
         return SIMULATOR
     source: Semantics = SEMANTICS.make(semantics)
     if "ids" in source.needs:
-        raise ArgumentError(f"Agent: {type(source).__name__} knows one scene; give semantics='simulator' for any")
+        raise ArgumentError(
+            f"Agent: {type(source).__name__} knows only one scene; give semantics='simulator' for any scene"
+        )
     return source
 
 
 class Labelled(ImaginerWrapper):
-    """A world model that is given the semantic label of each pixel of the panorama.
+    """A world model that gets a semantic label for each pixel of the panorama.
 
     Args:
         model: a world model, or an imaginer.
@@ -50,23 +52,23 @@ class Labelled(ImaginerWrapper):
         self._environments = LiveEnvironments()
 
     def grant(self, environments: LiveEnvironments) -> None:
-        """Take the environments, whose own semantics the source "simulator" gives, and pass them on."""
+        """Take the environments, whose own semantics the source "simulator" uses, and pass them on."""
         self._environments = environments
         super().grant(environments)
 
     @property
     def needs(self) -> frozenset[str]:
-        """The model's, and depth where the source needs it."""
+        """The model's needs, and depth if the source needs it."""
         own = frozenset() if isinstance(self.source, str) else frozenset(self.source.needs) & {"depth"}
         return super().needs | own
 
     @property
     def gives(self) -> frozenset[str]:
-        """Semantics, beside what the wrapped imaginer gives."""
+        """Semantics, in addition to what the wrapped imaginer gives."""
         return super().gives | {"semantic"}
 
     def imagine(self, request: Request) -> Imagination:
-        """Imagine with labels, where the model needs them; what is labelled already stays so."""
+        """Imagine with labels, if the model needs them; existing labels are kept."""
         if "semantic" not in self.accepts.needs:
             return super().imagine(request)
         if isinstance(self.source, str):

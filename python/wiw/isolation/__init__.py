@@ -1,2 +1,2 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Models and policies of one's own in processes of their own, which never held a simulator; see `docs/firewall.md`."""
+"""The user's own models and policies in separate processes, which never held a simulator; see `docs/firewall.md`."""

@@ -107,7 +107,7 @@ def _call(host: Host, body: bytes, arrays: list[NDArray[np.uint8]]) -> dict[str,
     except Exception as error:
         return {"error": {"type": "", "text": describe_exception(error)}}
     except BaseException as error:
-        text = f"{error!r}, as if to end the process; a model that cannot answer raises an Exception"
+        text = f"{error!r}, as if to end the process; a model that cannot answer should raise an Exception"
         return {"error": {"type": "ExitError", "text": text}}
 
 

@@ -11,7 +11,7 @@ from collections.abc import Sequence
 HEAD = struct.Struct("<QI")
 """Bytes of the message, and descriptors that come with it."""
 MOST_BYTES = 2**28
-"""Most bytes of a message; frames and images go through shared memory instead."""
+"""Maximum size of a message in bytes; frames and images go through shared memory instead."""
 MOST_DESCRIPTORS = 64
 
 

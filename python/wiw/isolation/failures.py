@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The ways in which a call of somebody else's code fails, beyond the exceptions that it raises."""
+"""How a call of a user's code can fail, besides the exceptions that it raises."""
 
 from __future__ import annotations
 
@@ -23,6 +23,6 @@ class EndedError(Exception):
 
 
 class RaisedError(Exception):
-    """The code has raised an exception in a process of its own; the message has its type, text and place."""
+    """The code has raised an exception in a separate process; the message has its type, text and place."""
 
     kind = "raised"

@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
-"""World models of one's own, each in a process of its own.
+"""World models of one's own, each in a separate process.
 
-`find_isolated_model` returns a class that stands for the one behind a name: it tells the same about itself, and an
+`find_isolated_model` returns a class that stands for the one behind a name: it describes itself in the same way, and an
 instance of it passes each rollout on to the instance in its process. Nothing of the model's code is imported here.
 """
 
@@ -21,11 +21,19 @@ from numpy.typing import NDArray
 from wiw.errors import ArgumentError, RegistryError
 from wiw.isolation.child import Host
 from wiw.isolation.failures import ExitError, RaisedError
-from wiw.isolation.source import Isolated, Source, build_signature, read_file_state, tell_class
+from wiw.isolation.source import Isolated, Source, build_signature, describe_class, read_file_state
 from wiw.json_text import parse_json
 from wiw.registry import WORLD_MODELS
 from wiw.types import Conditioning, Control
-from wiw.world_models.base import Accepts, Requirements, WorldModel, answer_deadline, require_frames, seconds_left
+from wiw.world_models.base import (
+    Accepts,
+    Requirements,
+    WorldModel,
+    answer_deadline,
+    find_accepts,
+    require_frames,
+    seconds_left,
+)
 from wiw.world_models.remote.declaration import declaration, parse_declaration
 
 DOOR = {"isolate": (True, "bool"), "memory_gb": (None, "float | None")}
@@ -51,7 +59,7 @@ def find_isolated_model(name: str) -> type[IsolatedModel]:
     """Return the class that stands for the world model of a name, such as "model.py:MyModel".
 
     Raises:
-        RegistryError: it cannot be imported, which is tried in a process of its own.
+        RegistryError: it cannot be imported, which is tried in a separate process.
     """
     return _make_class(name, read_file_state(name))
 
@@ -60,22 +68,24 @@ def find_isolated_model(name: str) -> type[IsolatedModel]:
 def _make_class(name: str, state: tuple[str, int, int] | None) -> type[IsolatedModel]:
     """Return the class of a name; an edited file has another one."""
     source = Source("world model", name, load_model)
-    told = source.told
+    described = source.description
     attributes: dict[str, Any] = {
         "source": source,
-        "version": told["version"],
-        "requires": Requirements(packages=tuple(told["packages"]), extra=told["extra"], weights=told["weights"]),
-        "__signature__": build_signature(told["parameters"], DOOR),
-        "__module__": told["module"],
-        "__doc__": told["doc"],
+        "version": described["version"],
+        "requires": Requirements(
+            packages=tuple(described["packages"]), extra=described["extra"], weights=described["weights"]
+        ),
+        "__signature__": build_signature(described["parameters"], DOOR),
+        "__module__": described["module"],
+        "__doc__": described["doc"],
     }
-    if told["accepts"]:
-        attributes["accepts"] = _Declared(parse_declaration(told["accepts"]))
-    return type(told["name"], (IsolatedModel,), attributes)
+    if described["accepts"]:
+        attributes["accepts"] = _Declared(parse_declaration(described["accepts"]))
+    return type(described["name"], (IsolatedModel,), attributes)
 
 
 class IsolatedModel(Isolated, WorldModel):
-    """Stands for a world model in a process of its own.
+    """Stands for a world model in a separate process.
 
     Args:
         isolate: False makes the model in this process instead, and returns it itself.
@@ -86,7 +96,7 @@ class IsolatedModel(Isolated, WorldModel):
     Raises:
         ConstructionError: the constructor raised, did not return in time, or ended its process; and errors of wiw that
             it raised.
-        ArgumentError: the model asks for the simulator.
+        ArgumentError: the model requires the simulator.
     """
 
     def __new__(cls, isolate: bool = True, memory_gb: float | None = None, **options: Any) -> Any:
@@ -100,8 +110,8 @@ class IsolatedModel(Isolated, WorldModel):
         self._accepts = parse_declaration(self._begin())
         if "simulator" in self._accepts.needs:
             raise ArgumentError(
-                f"world model '{self.source.name}' needs the simulator, which only the oracle is handed; to study a "
-                "privileged model of your own, give it isolate=false"
+                f"world model '{self.source.name}' needs the simulator, which only the oracle is given; to study your "
+                "own privileged model, give it isolate=false"
             )
 
     def __reduce__(self) -> Any:
@@ -178,14 +188,14 @@ def _make_again(name: str, options: Mapping[str, Any]) -> Any:
 
 
 def load_model(host: Host, name: str) -> dict[str, Any]:
-    """Import the class or factory behind a name; return what it tells before it is called."""
+    """Import the class or factory behind a name; return its description, which is available before any call."""
     host.thing = thing = WORLD_MODELS.find_here(name)
     host.make = partial(WORLD_MODELS.make_here, name)
-    declared, requires = getattr(thing, "accepts", None), getattr(thing, "requires", Requirements())
+    declared, requires = find_accepts(thing), getattr(thing, "requires", Requirements())
     return {
-        **tell_class(thing),
+        **describe_class(thing),
         "version": str(getattr(thing, "version", "")),
-        "accepts": declaration(declared) if isinstance(declared, Accepts) else "",
+        "accepts": declaration(declared) if declared else "",
         "packages": list(requires.packages),
         "extra": requires.extra,
         "weights": requires.weights,
@@ -214,7 +224,7 @@ def fingerprint_model(host: Host) -> str:
 def roll_out(
     host: Host, observations: Conditioning, controls: Sequence[Control], seeds: NDArray[np.uint64], seconds: float
 ) -> dict[str, float]:
-    """Write the model's frames into the memory of the answer; return what it has used up so far."""
+    """Write the model's frames into the memory of the answer; return what it has consumed so far."""
     with answer_deadline(seconds):
         frames = host.made.rollout(observations, controls, seeds)
     require_frames(host.made, frames, observations, controls)

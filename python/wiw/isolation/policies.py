@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Policies of one's own, each in a process of its own, by the name "isolated:policy.py:MyPolicy".
+"""Policies of one's own, each in a separate process, by the name "isolated:policy.py:MyPolicy".
 
 The memories of episodes stay in that process; the loop holds handles of them.
 """
@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 
 from wiw.errors import ContractError, RegistryError
 from wiw.isolation.child import Host
-from wiw.isolation.source import Isolated, Source, build_signature, read_file_state, tell_class
+from wiw.isolation.source import Isolated, Source, build_signature, describe_class, read_file_state
 from wiw.json_text import parse_json
 from wiw.policies.base import FrameSpec, Policy, Situation
 from wiw.registry import POLICIES
@@ -34,7 +34,7 @@ def find_isolated_policy(name: str) -> type[IsolatedPolicy]:
     """Return the class that stands for the policy of a name, such as "policy.py:MyPolicy".
 
     Raises:
-        RegistryError: it cannot be imported, which is tried in a process of its own; or it ships with wiw.
+        RegistryError: it cannot be imported, which is tried in a separate process; or it ships with wiw.
     """
     if not POLICIES.is_foreign(name):
         raise RegistryError(f"isolated: expected a policy of your own, as isolated:path.py:Class, got '{name}'")
@@ -45,26 +45,26 @@ def find_isolated_policy(name: str) -> type[IsolatedPolicy]:
 def _make_class(name: str, state: tuple[str, int, int] | None) -> type[IsolatedPolicy]:
     """Return the class of a name; an edited file has another one."""
     source = Source("policy", name, load_policy)
-    told = source.told
+    described = source.description
     attributes: dict[str, Any] = {
         "source": source,
-        "__signature__": build_signature(told["parameters"], DOOR),
-        "__module__": told["module"],
-        "__doc__": told["doc"],
-        **_read_declaration(told),
+        "__signature__": build_signature(described["parameters"], DOOR),
+        "__module__": described["module"],
+        "__doc__": described["doc"],
+        **_read_declaration(described),
     }
-    return type(told["name"], (IsolatedPolicy,), attributes)
+    return type(described["name"], (IsolatedPolicy,), attributes)
 
 
 class _MemoryHandle:
-    """Stands for the memory of an episode that lies in the policy's process."""
+    """Handle of an episode's memory, which stays in the policy's process."""
 
     def __init__(self, number: int) -> None:
         self.number = number
 
 
 class IsolatedPolicy(Isolated, Policy):
-    """Stands for a policy in a process of its own.
+    """Stands for a policy in a separate process.
 
     A call that fails or is late loses all memories: its episodes end with errors, or begin anew.
 
@@ -92,16 +92,16 @@ class IsolatedPolicy(Isolated, Policy):
     @property
     def can_revise(self) -> bool:
         """Whether the policy scores imagined futures itself."""
-        return bool(self._told["can_revise"])
+        return bool(self._declared["can_revise"])
 
     @property
     def can_extend(self) -> bool:
         """Whether the policy can propose from an imagined place."""
-        return bool(self._told["can_extend"])
+        return bool(self._declared["can_extend"])
 
     def describe(self) -> dict[str, Any]:
         """Return what the policy says of itself."""
-        described: dict[str, Any] = parse_json(self._told["described"])
+        described: dict[str, Any] = parse_json(self._declared["described"])
         return described
 
     def begin(self, goal: Goal, key: Key) -> Any:
@@ -147,20 +147,20 @@ class IsolatedPolicy(Isolated, Policy):
         rollouts: Sequence[Sequence[Rollout] | None],
     ) -> Sequence[Answer | TextAnswer | None]:
         """Return what the policy believes."""
-        if not self._told["answers"]:
+        if not self._declared["answers"]:
             return [None] * len(situations)
         return [_read_answer(each) for each in self._call(answer, _hide_memories(situations), proposals, rollouts)]
 
     def draw(self, situation: Situation, decision: Decision, north: float) -> Mapping[str, NDArray[np.uint8]]:
         """Return the policy's pictures, in which the heading at the start is up: the true north stays here."""
-        if not self._told["draws"]:
+        if not self._declared["draws"]:
             return {}
         found = self._call(draw, _hide_memories([situation])[0], replace(decision, key=None), 0.0)
         return {str(name): _read_array("draw", each) for name, each in found.items()}
 
     def exchanges(self, key: Key) -> tuple[Exchange, ...]:
         """Return the language model's exchanges of this decision."""
-        if not self._told["exchanges"]:
+        if not self._declared["exchanges"]:
             return ()
         return tuple(
             Exchange(**{**each, "said": tuple(each["said"])}) for each in json.loads(self._call(list_exchanges, key))
@@ -168,8 +168,8 @@ class IsolatedPolicy(Isolated, Policy):
 
     def _begin(self) -> None:
         """Make the policy in a process that has none."""
-        self._told: dict[str, Any] = self._make(make_policy, self._options, seconds=self._deadline)
-        for attribute, value in _read_declaration(self._told).items():
+        self._declared: dict[str, Any] = self._make(make_policy, self._options, seconds=self._deadline)
+        for attribute, value in _read_declaration(self._declared).items():
             setattr(self, attribute, value)
 
     def _call(self, function: Any, *arguments: Any) -> Any:
@@ -189,12 +189,12 @@ def _hide_memories(situations: Sequence[Situation]) -> list[Situation]:
     return [replace(each, memory=each.memory.number) for each in situations]
 
 
-def _read_declaration(told: Mapping[str, Any]) -> dict[str, Any]:
+def _read_declaration(declared: Mapping[str, Any]) -> dict[str, Any]:
     return {
-        "space": str(told["space"]),
-        "needs": tuple(map(str, told["needs"])),
-        "frames": _read_frames(**told["frames"]),
-        "default_revision": None if told["default_revision"] is None else str(told["default_revision"]),
+        "space": str(declared["space"]),
+        "needs": tuple(map(str, declared["needs"])),
+        "frames": _read_frames(**declared["frames"]),
+        "default_revision": None if declared["default_revision"] is None else str(declared["default_revision"]),
     }
 
 
@@ -202,45 +202,46 @@ def _read_frames(view: Any, size: Any, ends: Any, source_size: Any) -> FrameSpec
     return FrameSpec(str(view), _read_size(size), bool(ends), None if source_size is None else _read_size(source_size))
 
 
-def _read_size(told: Any) -> tuple[int, int]:
-    height, width = told
+def _read_size(packed: Any) -> tuple[int, int]:
+    height, width = packed
     return int(height), int(width)
 
 
-def _read_plans(told: Any) -> list[list[Proposal]]:
-    return [[Proposal(_read_array("propose", actions), *rest) for actions, *rest in own] for own in told]
+def _read_plans(packed: Any) -> list[list[Proposal]]:
+    return [[Proposal(_read_array("propose", actions), *rest) for actions, *rest in own] for own in packed]
 
 
-def _read_array(call: str, told: Any) -> NDArray[Any]:
-    return unpack_array(call, told).copy()
+def _read_array(call: str, packed: Any) -> NDArray[Any]:
+    return unpack_array(call, packed).copy()
 
 
-def _read_answer(told: Any) -> Answer | TextAnswer | None:
-    if told is None:
+def _read_answer(packed: Any) -> Answer | TextAnswer | None:
+    if packed is None:
         return None
-    if "text" in told:
-        return TextAnswer(str(told["text"]), float(told["confidence"]), bool(told["final"]))
-    raw = None if told["raw"] is None else _read_array("answer", told["raw"])
-    return Answer(tuple(map(str, told["choices"])), _read_array("answer", told["probabilities"]), raw)
+    if "text" in packed:
+        return TextAnswer(str(packed["text"]), float(packed["confidence"]), bool(packed["final"]))
+    raw = None if packed["raw"] is None else _read_array("answer", packed["raw"])
+    return Answer(tuple(map(str, packed["choices"])), _read_array("answer", packed["probabilities"]), raw)
 
 
 # -- in the policy's process -------------------------------------------------------------------------------------------
 
 
 def load_policy(host: Host, name: str) -> dict[str, Any]:
-    """Import the class or factory behind a name; return what it tells before it is called."""
+    """Import the class or factory behind a name; return its description, which is available before any call."""
     host.thing = POLICIES.find_here(name)
     host.make = partial(POLICIES.make_here, name)
-    return {**tell_class(host.thing), **_declare(host.thing)}
+    return {**describe_class(host.thing), **_declare(host.thing)}
 
 
 def _declare(thing: Any) -> dict[str, Any]:
     """Return what a class, or an instance, declares."""
     names = ("space", "needs", "frames", "default_revision")
-    told = {name: getattr(thing, name, getattr(Policy, name)) for name in names}
-    told = {name: getattr(Policy, name) if isinstance(value, property) else value for name, value in told.items()}
-    frames = told["frames"]
-    return {**told, "needs": list(told["needs"]), "frames": asdict(frames)}
+    defaults = {name: getattr(Policy, name) for name in names}
+    found = {name: getattr(thing, name, default) for name, default in defaults.items()}
+    declared = {name: defaults[name] if isinstance(value, property) else value for name, value in found.items()}
+    frames = declared["frames"]
+    return {**declared, "needs": list(declared["needs"]), "frames": asdict(frames)}
 
 
 def make_policy(host: Host, options: Mapping[str, Any]) -> dict[str, Any]:
@@ -278,34 +279,34 @@ def observe(host: Host, situations: Sequence[Situation]) -> None:
 
 def propose(host: Host, situations: Sequence[Situation], candidates: int, horizon: int) -> Any:
     """Return the policy's plans as plain values."""
-    return _tell_plans(host.made.propose(_show_memories(host, situations), candidates, horizon))
+    return _pack_plans(host.made.propose(_show_memories(host, situations), candidates, horizon))
 
 
 def extend(host: Host, situations: Sequence[Situation], candidates: int, horizon: int) -> Any:
     """Return the policy's continuations as plain values."""
-    return _tell_plans(host.made.extend(_show_memories(host, situations), candidates, horizon))
+    return _pack_plans(host.made.extend(_show_memories(host, situations), candidates, horizon))
 
 
 def score(host: Host, situations: Sequence[Situation], proposals: Any, rollouts: Any) -> Any:
     """Return the policy's scores."""
-    return [_tell_array(each) for each in host.made.score(_show_memories(host, situations), proposals, rollouts)]
+    return [_pack_values(each) for each in host.made.score(_show_memories(host, situations), proposals, rollouts)]
 
 
 def revise(host: Host, situation: Situation, proposals: Any, scores: Any) -> Any:
     """Return the plan that the policy decides on, and its number."""
     actions, chosen = host.made.revise(_show_memories(host, [situation])[0], proposals, scores)
-    return _tell_array(actions), None if chosen is None else int(chosen)
+    return _pack_values(actions), None if chosen is None else int(chosen)
 
 
 def answer(host: Host, situations: Sequence[Situation], proposals: Any, rollouts: Any) -> Any:
     """Return what the policy believes."""
-    return [_tell_answer(each) for each in host.made.answer(_show_memories(host, situations), proposals, rollouts)]
+    return [_pack_answer(each) for each in host.made.answer(_show_memories(host, situations), proposals, rollouts)]
 
 
 def draw(host: Host, situation: Situation, decision: Decision, north: float) -> Any:
     """Return the policy's pictures."""
     found = host.made.draw(_show_memories(host, [situation])[0], decision, north)
-    return {name: _tell_array(picture) for name, picture in found.items()}
+    return {name: _pack_values(picture) for name, picture in found.items()}
 
 
 def list_exchanges(host: Host, key: Key) -> str:
@@ -316,24 +317,24 @@ def list_exchanges(host: Host, key: Key) -> str:
 def _show_memories(host: Host, situations: Sequence[Situation]) -> list[Situation]:
     missing = [each.memory for each in situations if each.memory not in host.memories]
     if missing:
-        raise RuntimeError("the policy's process has ended since, and with it the memory of this episode")
+        raise RuntimeError("the policy's process has ended, and its memory of this episode is lost")
     return [replace(each, memory=host.memories[each.memory]) for each in situations]
 
 
-def _tell_plans(plans: Any) -> Any:
+def _pack_plans(plans: Any) -> Any:
     if not isinstance(plans, Sequence) or not all(isinstance(each, Proposal) for own in plans for each in own):
         raise ContractError(f"propose: expected a list of wiw.types.Proposal for each episode, got {plans!r:.200}")
-    return [[(_tell_array(each.actions), float(each.prior), each.note, each.text) for each in own] for own in plans]
+    return [[(_pack_values(each.actions), float(each.prior), each.note, each.text) for each in own] for own in plans]
 
 
-def _tell_array(array: Any) -> Any:
+def _pack_values(array: Any) -> Any:
     return pack_array(np.asarray(array))
 
 
-def _tell_answer(believed: Answer | TextAnswer | None) -> Any:
+def _pack_answer(believed: Answer | TextAnswer | None) -> Any:
     if believed is None:
         return None
     if isinstance(believed, TextAnswer):
         return {"text": believed.text, "confidence": float(believed.confidence), "final": bool(believed.final)}
-    raw = None if believed.raw is None else _tell_array(believed.raw)
-    return {"choices": list(believed.choices), "probabilities": _tell_array(believed.probabilities), "raw": raw}
+    raw = None if believed.raw is None else _pack_values(believed.raw)
+    return {"choices": list(believed.choices), "probabilities": _pack_values(believed.probabilities), "raw": raw}

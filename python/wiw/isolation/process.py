@@ -34,7 +34,7 @@ from wiw import errors
 from wiw.errors import InfrastructureError
 from wiw.isolation.connection import receive, send
 from wiw.isolation.failures import EndedError, ExitError, LateError, RaisedError
-from wiw.isolation.segments import Segment, SegmentPool, place
+from wiw.isolation.segments import SegmentPool, SharedSegment, place
 from wiw.process_limits import find_memory_limit, make_child_environment
 
 STARTING = 120.0
@@ -140,7 +140,7 @@ class ChildProcess:
 
     def _pack(
         self, function: Callable[..., Any], arguments: tuple[Any, ...], answer: int
-    ) -> tuple[bytes, list[Segment], NDArray[np.uint8]]:
+    ) -> tuple[bytes, list[SharedSegment], NDArray[np.uint8]]:
         """Return the request, the segments that are new to the child, and the memory of the answer."""
         arrays: list[NDArray[np.uint8]] = []
         body = pickle.dumps((function, arguments), protocol=5, buffer_callback=lambda each: _take_out(each, arrays))
@@ -178,7 +178,7 @@ class ChildProcess:
         try:
             reply = msgpack.unpackb(data, strict_map_key=False)
         except Exception as error:
-            raise OSError(f"no msgpack: {error}") from None
+            raise OSError(f"not valid msgpack: {error}") from None
         if not isinstance(reply, dict):
             raise OSError("expected a map")
         return reply
@@ -205,8 +205,8 @@ class ChildProcess:
             if (taken := _read_own_memory(self._process.pid)) > self._most:
                 self.kill()
                 raise EndedError(
-                    f"its process took {taken / 1e9:.1f} GB of memory, more than {self._most / 1e9:.1f} (memory_gb), "
-                    "and was killed"
+                    f"its process took {taken / 1e9:.1f} GB of memory, more than the limit of {self._most / 1e9:.1f} "
+                    "(memory_gb), and was killed"
                 )
 
     def _describe_end(self) -> str:
@@ -219,11 +219,11 @@ class ChildProcess:
             code = None
         self.kill()
         if code is None:
-            return "its process closed its connection, or sent what is no reply"
+            return "its process closed its connection, or sent something that is not a reply"
         if code >= 0:
             return f"its process ended with exit code {code}"
         name = signal.Signals(-code).name
-        return f"its process ended with {name}" + (", perhaps for lack of memory" if name == "SIGKILL" else "")
+        return f"its process ended with {name}" + (", perhaps out of memory" if name == "SIGKILL" else "")
 
 
 def _read_own_memory(process: int) -> int:
@@ -242,7 +242,7 @@ def _starter() -> ThreadPoolExecutor:
 
 
 def _open(command: list[str], descriptor: int) -> subprocess.Popen[bytes]:
-    """Start a child in a process group of its own, without input; what it prints goes to standard error."""
+    """Start a child in its own process group, without input; its output goes to standard error."""
     return subprocess.Popen(
         command,
         stdin=subprocess.DEVNULL,
@@ -273,11 +273,11 @@ def _take_out(buffer: pickle.PickleBuffer, arrays: list[NDArray[np.uint8]]) -> b
     return False
 
 
-def _build_error(told: Any) -> Exception:
-    """Return the exception that a child has told of: one of wiw's own, or what stands for somebody else's."""
-    told = told if isinstance(told, dict) else {}
-    text = str(told.get("text", ""))
-    name, kind = str(told.get("type", "")), told.get("kind")
+def _build_error(message: Any) -> Exception:
+    """Return the exception that a child has reported: one of wiw's own, or a substitute for a foreign one."""
+    message = message if isinstance(message, dict) else {}
+    text = str(message.get("text", ""))
+    name, kind = str(message.get("type", "")), message.get("kind")
     if name == "ExitError":
         return ExitError(text)
     own = getattr(errors, name, None) if name in errors.__all__ and name != "is_stop_request" else None
@@ -285,6 +285,6 @@ def _build_error(told: Any) -> Exception:
         return RaisedError(text)
     try:
         error: Exception = own(text, kind) if isinstance(kind, str) else own(text)
-    except TypeError:  # it takes more than the child has told
+    except TypeError:  # it takes more than the child reports
         return RaisedError(text)
     return error

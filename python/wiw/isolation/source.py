@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Code of somebody else's, imported in processes of its own: what it says of its class, and processes to make it in."""
+"""A user's code, imported in separate processes: the description of its class, and processes to build it in."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ _SOURCES: weakref.WeakSet[Source] = weakref.WeakSet()
 
 
 def end_idle_processes() -> None:
-    """End the processes that have only told what their code says of itself, where other processes will run it."""
+    """End the processes that have only described their code, where other processes will run it."""
     for source in list(_SOURCES):
         source.end_idle()
 
@@ -37,7 +37,7 @@ class Source:
     def __init__(self, kind: str, name: str, load: Callable[[Host, str], dict[str, Any]]) -> None:
         self.kind, self.name, self._load = kind, name, load
         self._idle: ChildProcess | None = None
-        self.told = self.load(process := ChildProcess())
+        self.description = self._import(process := ChildProcess())
         self._idle = process
         _SOURCES.add(self)
 
@@ -62,25 +62,29 @@ class Source:
         self.load(process)
         return process
 
-    def load(self, process: ChildProcess) -> dict[str, Any]:
-        """Import the code in a process; return what it says of itself.
+    def load(self, process: ChildProcess) -> None:
+        """Import the code in a process.
 
         Raises:
             RegistryError: it cannot be imported.
-            InfrastructureError: it is not what it was when it was imported first.
+            InfrastructureError: it has changed since it was first imported.
         """
+        found = self._import(process)
+        names = ("module", "name")  # a module's has the state of its file
+        if any(found[name] != self.description[name] for name in names):
+            raise InfrastructureError(f"{self.kind} '{self.name}' has changed since it was loaded; start a new run")
+
+    def _import(self, process: ChildProcess) -> dict[str, Any]:
+        """Import the code in a process; return what it says of itself."""
         try:
-            told: dict[str, Any] = process.call(self._load, self.name)[0]
+            description: dict[str, Any] = process.call(self._load, self.name)[0]
         except (EndedError, ExitError) as error:
             raise RegistryError(f"{self.kind} '{self.name}' cannot be loaded: {error}") from None
-        first = getattr(self, "told", told)
-        if (told["module"], told["name"]) != (first["module"], first["name"]):  # the module's name has the file's state
-            raise InfrastructureError(f"{self.kind} '{self.name}' has changed since it was loaded; begin a new run")
-        return told
+        return description
 
 
 class Isolated:
-    """Base of what stands for a part in a process of its own; where that has ended, another one is begun.
+    """Base of what stands for a part in a separate process; if that has ended, another one is started.
 
     Args:
         memory_gb: most gigabytes of memory that a process may take, without those that it starts; three quarters of
@@ -133,19 +137,19 @@ class Isolated:
         self._spent_before += self._spent
         self._spent = Counter()
         process = self.source.take_process(self._memory_gb)
-        cannot = f"{self.source.kind} '{self.source.name}' cannot be made"
+        cannot = f"{self.source.kind} '{self.source.name}' cannot be built"
         try:
-            told = process.call(function, *arguments, seconds=seconds)[0]
+            answer = process.call(function, *arguments, seconds=seconds)[0]
         except LateError as error:
             raise ConstructionError(
-                f"{cannot}: its constructor did not return within {seconds:g} s (deadline). Does it wait for a "
-                "download, a lock, a server or a prompt? If it is only slow, give a longer deadline",
+                f"{cannot}: its constructor did not return within {seconds:g} s (deadline). Is it waiting for a "
+                "download, a lock, a server or a prompt? If it is just slow, give a longer deadline",
                 "deadline",
             ) from error
         except (EndedError, ExitError) as error:
             raise ConstructionError(f"{cannot}: {error}", error.kind) from None
         self._process = process
-        return told
+        return answer
 
     def _count_spent(self, spent: Mapping[str, Any]) -> None:
         """Note what the part has used up in its present process."""
@@ -153,7 +157,7 @@ class Isolated:
 
 
 def read_file_state(name: str) -> tuple[str, int, int] | None:
-    """Return what tells versions of the file of "path.py:Class" apart; None for a name without a file."""
+    """Return an identifier of the version of the file in "path.py:Class"; None for a name without a file."""
     path = Path(name.rpartition(":")[0]).expanduser()
     if path.suffix != ".py" or not path.is_file():
         return None
@@ -161,18 +165,19 @@ def read_file_state(name: str) -> tuple[str, int, int] | None:
     return str(path.resolve()), status.st_mtime_ns, status.st_size
 
 
-def tell_class(thing: Any) -> dict[str, Any]:
-    """Return what a class or factory tells of itself before it is called."""
+def describe_class(thing: Any) -> dict[str, Any]:
+    """Return the description of a class or factory, which is available before it is called."""
     makes = inspect.isclass(thing) or inspect.isroutine(thing) or isinstance(thing, partial)
+    parameters = inspect.signature(thing).parameters.values() if makes else ()
     return {
         "name": str(getattr(thing, "__name__", type(thing).__name__)),
         "module": str(getattr(thing, "__module__", "")),
         "doc": inspect.getdoc(thing) or "",
-        "parameters": [_tell_parameter(each) for each in inspect.signature(thing).parameters.values()] if makes else [],
+        "parameters": [_describe_parameter(each) for each in parameters],
     }
 
 
-def _tell_parameter(parameter: inspect.Parameter) -> dict[str, Any]:
+def _describe_parameter(parameter: inspect.Parameter) -> dict[str, Any]:
     empty = inspect.Parameter.empty
     annotation = "" if parameter.annotation is empty else inspect.formatannotation(parameter.annotation).strip("'")
     value = parameter.default
@@ -202,13 +207,13 @@ def build_signature(parameters: Sequence[Mapping[str, Any]], own: Mapping[str, t
     return inspect.Signature([*(parameter for parameter in built if parameter not in last), *added, *last])
 
 
-def _read_default(told: Any) -> Any:
-    if told is None:
+def _read_default(packed: Any) -> Any:
+    if packed is None:
         return inspect.Parameter.empty
-    return _Hidden(told["repr"]) if "repr" in told else told["value"]
+    return _HiddenDefault(packed["repr"]) if "repr" in packed else packed["value"]
 
 
-class _Hidden:
+class _HiddenDefault:
     """A default value that the class keeps to itself."""
 
     def __init__(self, text: str) -> None:

@@ -56,7 +56,7 @@ class Judgement:
     judge: str
     """Name of the judge that gave it."""
     approximate: bool = False
-    """Whether it compares words only; such marks are no substitute for rules or a language model."""
+    """Whether it compares words only; such marks do not replace rules or a language model."""
     model: str = ""
     prompt_digest: str = ""
     reply: str = ""
@@ -89,7 +89,7 @@ class Judge(ABC):
 
     @property
     def concurrency(self) -> int:
-        """How many answers are best judged at a time, each in a thread of its own."""
+        """How many answers are best judged at a time, each in its own thread."""
         return 1
 
     def judge(self, references: Sequence[Reference], answers: Sequence[str]) -> list[Judgement]:
@@ -153,7 +153,7 @@ class TieredJudge(Judge):
 
     @property
     def concurrency(self) -> int:
-        """Most answers judged at a time, by the judge that takes most."""
+        """Maximum number of answers judged at the same time, over the judges."""
         return max(tier.concurrency for tier in self.tiers)
 
     def can_judge(self, reference: Reference) -> bool:

@@ -97,7 +97,7 @@ def is_negated(words: Sequence[str], match: Match) -> bool:
 
 
 def _narrow_down(clause: list[str]) -> list[list[str]]:
-    """Return the parts of a clause that may name what is asked for, most specific first; each keeps its negation."""
+    """Return the parts of a clause that may name what is requested, most specific first; each keeps its negation."""
     verbs = [place for place, word in enumerate(clause) if word in _COPULAS]
     rest = clause[verbs[-1] + 1 :] if verbs else clause
     if any(word in NEGATIONS for word in clause) and not any(word in NEGATIONS for word in rest):
@@ -122,7 +122,7 @@ def read_counts(text: str) -> list[int]:
 
 
 def read_polarity(text: str, question: str = "") -> bool | None:
-    """Return whether an answer says yes; None where it says neither, or both.
+    """Return whether an answer says yes; None if it says neither, or both.
 
     Args:
         text: such as "yes", "No, there are no chairs", or with a question "it is shut".
@@ -130,7 +130,7 @@ def read_polarity(text: str, question: str = "") -> bool | None:
     """
     words = split_words(text)
     explicit = [word for word in words if word in _YES or word in _NO]
-    if not words or _UNSURE & set(words) or _says_both(words):
+    if not words or _UNSURE & set(words) or _says_yes_and_no(words):
         return None
     if words[0] in _YES | _NO:
         negated = words[1:2] == ["not"] and words[0] in _YES  # "certainly not"
@@ -141,7 +141,7 @@ def read_polarity(text: str, question: str = "") -> bool | None:
     return _compare_statement(text, question, negated)
 
 
-def _says_both(words: Sequence[str]) -> bool:
+def _says_yes_and_no(words: Sequence[str]) -> bool:
     """Return whether an answer begins with yes and no."""
     first = [word for word in words[:3] if word not in ("and", "or")][:2]
     return (
@@ -153,7 +153,7 @@ def _says_both(words: Sequence[str]) -> bool:
 
 
 def _compare_statement(text: str, question: str, negated: bool) -> bool | None:
-    """Return whether a statement agrees with a question; None where they are about different things."""
+    """Return whether a statement agrees with a question; None if they are about different things."""
     vocabulary = load_vocabulary()
     asked, said = split_words(question), split_words(text)
     for one, other in _OPPOSITES:

@@ -14,7 +14,7 @@ from wiw.judging.words import split_clauses
 
 ANCHOR_MARK, ROOM_MARK, CATEGORY_MARK = 4, 3, 2
 BROADER_ROOM_MARK = 4
-"""Mark of "bedroom" where "kids room" is all that was asked for."""
+"""Mark of "bedroom" where "kids room" is all that was requested."""
 _SIDES = {
     "under": ("under", "below", "beneath", "underneath"),
     "above": ("above", "over"),
@@ -69,8 +69,8 @@ def names_place(question: str, text: str) -> bool:
 def mark_place(question: str, right: str, answer: str) -> int:
     """Return 5 for anchor and room, 4 for the anchor, 3 for the room, 2 for a wrong anchor of the right category.
 
-    What the question mentions and the right answer does not, such as the thing whose place is asked for, is no anchor.
-    Where the right answer has only an anchor or only a room, that alone is worth 5.
+    What the question mentions and the right answer does not, such as the thing whose place is requested, is not an
+    anchor. Where the right answer has only an anchor or only a room, that alone is worth 5.
     """
     wanted = read_place(right)
     known = {part.concept for part in (*wanted.anchors, *wanted.rooms)}
@@ -129,7 +129,7 @@ def _fit_parts(wanted: Sequence[Part], said: Sequence[Part], spare: int) -> Fit:
 
 
 def _fit_part(wanted: Part, said: Part) -> Fit:
-    relation = load_vocabulary().relate(wanted.concept, said.concept)
+    relation = load_vocabulary().find_relation(wanted.concept, said.concept)
     if relation >= Relation.BROADER:
         if _contradict(wanted, said):
             return Fit.CATEGORY
@@ -139,7 +139,7 @@ def _fit_part(wanted: Part, said: Part) -> Fit:
 
 def _contradict(one: Part, other: Part) -> bool:
     """Return whether two mentions are of different things or of opposite sides of one."""
-    relate = load_vocabulary().relate
-    colors = one.colors and other.colors and not any(relate(a, b) for a in one.colors for b in other.colors)
+    find_relation = load_vocabulary().find_relation
+    colors = one.colors and other.colors and not any(find_relation(a, b) for a in one.colors for b in other.colors)
     numbers = one.number and other.number and one.number != other.number
     return bool(colors or numbers or frozenset((one.side, other.side)) in _CONTRADICTIONS)

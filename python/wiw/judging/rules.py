@@ -40,7 +40,7 @@ OPPOSITE_STATES = {
     "unmade": "made",
 }
 Rule = Callable[[str, str, str], "int | None"]
-"""(question, right answer, answer) to the mark; None where the right answer is beyond the rule."""
+"""(question, right answer, answer) to the mark; None if the right answer is beyond the rule."""
 
 
 class RuleJudge(Judge):
@@ -155,8 +155,8 @@ def _mark_concepts(right: list[Concept], said: list[Concept], marks: Mapping[Rel
         return None
     if not said:
         return LOWEST_MARK
-    relate = load_vocabulary().relate
-    table = [[marks.get(relate(one, other), LOWEST_MARK) for other in said] for one in right]
+    find_relation = load_vocabulary().find_relation
+    table = [[marks.get(find_relation(one, other), LOWEST_MARK) for other in said] for one in right]
     covered = sum(max(row) for row in table) / len(right)
     correct = sum(max(column) for column in zip(*table, strict=True)) / len(said)
     return int(min(covered, correct))

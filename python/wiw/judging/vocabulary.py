@@ -100,7 +100,7 @@ class Vocabulary:
                 start = match.end
         return found
 
-    def relate(self, one: Concept, other: Concept) -> Relation:
+    def find_relation(self, one: Concept, other: Concept) -> Relation:
         """Return how closely two concepts are related."""
         if one.kind != other.kind:
             return Relation.NONE
@@ -145,9 +145,9 @@ class Vocabulary:
                 name = self._names[kind].get(piece)
                 if name is not None:
                     return Match(Concept(kind, name), start, start + length)
-        return self._match_ish(words, start) if "color" in kinds else None
+        return self._match_approximate_color(words, start) if "color" in kinds else None
 
-    def _match_ish(self, words: Sequence[str], start: int) -> Match | None:
+    def _match_approximate_color(self, words: Sequence[str], start: int) -> Match | None:
         """Return the colour of a word such as "bluish" or "greyish"."""
         word = words[start]
         if not word.endswith("ish"):

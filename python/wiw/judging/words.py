@@ -42,7 +42,7 @@ _LAST_PERIOD = re.compile(r"\.(?!\d)")
 def cut_after_last_period(text: str) -> str:
     """Return a text without what follows its last period, as OpenEQA does: "a. b" becomes "a.".
 
-    The point of a number such as 2.5 is no period.
+    The point of a number such as 2.5 is not a period.
     """
     periods = list(_LAST_PERIOD.finditer(text))
     return text[: periods[-1].end()] if periods else text
@@ -87,7 +87,7 @@ def merge_numbers(words: list[str]) -> list[str]:
 
 
 def make_singular(word: str) -> str:
-    """Return the singular of a noun; words that are no plural stay as they are."""
+    """Return the singular of a noun; words that are not plural stay as they are."""
     if word in IRREGULAR_PLURALS:
         return IRREGULAR_PLURALS[word]
     if len(word) < 4 or word in _NO_PLURALS or not word.endswith("s") or word.endswith(("ss", "us", "is")):

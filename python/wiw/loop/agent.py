@@ -28,15 +28,15 @@ class Agent(BaseAgent):
 
     Args:
         policy: base and proposal policy (name or instance).
-        model: world model (name, class or instance), or an `Imaginer` that asks one; None runs the same loop with
-            imagination left out.
+        model: world model (name, class or instance), or an `Imaginer` that calls one; None runs the same loop without
+            imagination.
         reviser: policy that scores imagined futures; None means the policy itself, or its default reviser.
-        config: numbers of the search; what it leaves open is the task's, or the paper's ImageNav.
-        observers: measure decisions and change none.
-        numbers: any of `AgentConfig`'s, such as candidates=3 and horizon=5, in place of the config's.
+        config: parameters of the search; open ones are taken from the task, or from the paper's ImageNav.
+        observers: measure decisions without changing them.
+        numbers: parameters of `AgentConfig` that override the config's, such as candidates=3 and horizon=5.
 
     Raises:
-        ArgumentError: a number out of range; parts that do not fit each other, such as a model that takes other plans
+        ArgumentError: a number out of range; parts that do not fit together, such as a model that takes other plans
             than the policy makes.
     """
 
@@ -72,12 +72,12 @@ class Agent(BaseAgent):
         Args:
             observation: an `Observation`, or the environment's dict.
             goal: what the agent is asked to do.
-            key: names the decision for all randomness; `info["key"]` of the environment.
-            simulator: fork of the environment, for the oracle alone.
+            key: identifies the decision for all randomness; `info["key"]` of the environment.
+            simulator: fork of the environment, for the oracle only.
 
         Raises:
-            ArgumentError: a dict whose images have boxes drawn on them, which no world model is to see, or a
-                manipulator's, which lacks what policies are given.
+            ArgumentError: a dict whose images have boxes drawn on them, which world models must not see, or a
+                manipulator's, which lacks what policies need.
         """
         if simulator is not None:
             environments = LiveEnvironments()
@@ -92,7 +92,7 @@ class Agent(BaseAgent):
 
     @property
     def model(self) -> WorldModel | None:
-        """The world model that is asked; None without one."""
+        """The world model in use; None without one."""
         return self.parts.imaginer.model
 
     @property
@@ -102,24 +102,24 @@ class Agent(BaseAgent):
 
     @property
     def needs(self) -> tuple[str, ...]:  # type: ignore[override]
-        """Inputs that observations must carry beyond images: "depth"."""
+        """Inputs that observations must have besides images, such as "depth"."""
         return self.parts.needs
 
     def count_spent(self) -> Counter[str]:
-        """Return what the agent's model and policies have been asked for so far."""
+        """Return what the agent's model and policies have used so far."""
         return self.parts.count_spent()
 
     def grant(self, environments: LiveEnvironments) -> None:
-        """Give the privileged parts the environments that episodes are run in."""
+        """Give the privileged parts the environments in which episodes run."""
         self.parts.grant(environments)
 
     def forget(self, key: Key) -> None:
-        """Drop what is kept of an episode that has ended."""
+        """Drop what is kept of a finished episode."""
         self.parts.memories.forget(key)
         self.parts.imaginer.forget(key)
 
     def replace(self, **changes: Any) -> Agent:
-        """Return the same agent with other parts or numbers, e.g. `agent.replace(model="oracle")`."""
+        """Return the same agent with other parts or parameters, e.g. `agent.replace(model="oracle")`."""
         names = {name: changes.pop(name) for name in ("policy", "model", "reviser", "observers") if name in changes}
         spec = replace(self.spec, **names)
         config = set_numbers(changes.pop("config", spec.config), changes)

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The specification of an agent, by names or objects, and how its parts are built and checked against each other."""
+"""Specify an agent by names or objects, build its parts and check them against each other."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ from wiw.types import PRIMITIVES
 
 @dataclass(frozen=True)
 class AgentSpec:
-    """An agent's parts as the user names them, before anything is looked up; see `wiw.Agent`."""
+    """An agent's parts as given by the user, before anything is looked up; see `wiw.Agent`."""
 
     policy: Any
     model: Any
@@ -32,7 +32,7 @@ class AgentSpec:
     observers: tuple[Observer, ...]
 
     def build(self) -> AgentParts:
-        """Look the parts up and check that they fit each other.
+        """Look up the parts and check that they fit together.
 
         Raises:
             ArgumentError: they do not.
@@ -64,7 +64,8 @@ class AgentSpec:
             reviser = POLICIES.make(policy.default_revision, **space_option(POLICIES, policy.default_revision, space))
         else:
             raise ArgumentError(
-                f"Agent: policy {type(policy.unwrapped).__name__} only proposes; give `reviser=` a policy that scores"
+                f"Agent: policy {type(policy.unwrapped).__name__} only proposes; give a policy that scores as "
+                "`reviser=`"
             )
         if reviser.space != space:
             raise ArgumentError(
@@ -75,7 +76,7 @@ class AgentSpec:
 
 
 def _space_of(policy: Any) -> str:
-    """Return what a policy plans in; one of several spaces, made by name, plans in primitives."""
+    """Return the space a policy plans in; one that supports several spaces and is built by name plans in primitives."""
     found = POLICIES.find(policy) if isinstance(policy, str) else policy
     if isinstance(found, Policy) or (inspect.isclass(found) and issubclass(found, Policy)):
         return found.space
@@ -86,8 +87,8 @@ def _make_policy(policy: Any, space: str) -> Policy:
     made: Policy = POLICIES.make(policy, **space_option(POLICIES, policy, space))
     if made.space != space:
         raise ArgumentError(
-            f"Agent: expected plans in {plan_space(space).words}, but policy {type(made.unwrapped).__name__} "
-            f"makes them of {plan_space(made.space).words}"
+            f"Agent: expected plans in {plan_space(space).words}, but policy {type(made.unwrapped).__name__} makes "
+            f"plans of {plan_space(made.space).words}"
         )
     return made
 
@@ -100,7 +101,7 @@ def _make_imaginer(model: Any, space: str) -> Imaginer:
 
 
 def space_option(registry: Registry, what: Any, space: str) -> dict[str, str]:
-    """Return the plan space as an option, for a name whose factory makes parts for several."""
+    """Return the plan space as an option, for a name whose factory builds parts for several spaces."""
     found = registry.find(what) if isinstance(what, str) else what
     if not (inspect.isclass(found) or inspect.isfunction(found)):
         return {}

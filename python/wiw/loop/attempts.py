@@ -1,17 +1,17 @@
 # SPDX-License-Identifier: Apache-2.0
 """Asking a world model until it answers as agreed: a few tries a call, each within a deadline.
 
-A call that outlives its deadline is abandoned, for Python cannot end a thread: it goes on until it returns by itself or
-the process ends, with its memory, and on a GPU with its place in the queue. The next try waits once more for it, so
-that a model that is merely slow is never entered twice at a time; then it asks in a new thread, which mends a lost
+A call that outlives its deadline is abandoned, as Python cannot end a thread: it continues until it returns or the
+process ends, with its memory, and on a GPU with its place in the queue. The next try waits once more for it, so that a
+model that is merely slow is never entered twice at a time; then it calls in a new thread, which recovers from a lost
 request to a server. A GPU kernel that never ends lets every try pass its deadline, and the episode fails. Compiled code
 that hangs while it holds Python's lock stops the process: nothing in it can look at a clock.
 
-A model in a process of its own (`wiw.isolation`) is asked in the caller's thread: where it is late, its process is
+A model in a separate process (`wiw.isolation`) is asked in the caller's thread: where it is late, its process is
 killed, and the next try finds a new one.
 
-A model cannot end the process: `sys.exit()` in it is an error of its own like any exception. Threads that it starts in
-its constructor or in a call are daemons unless it says otherwise, for they are started in one.
+A model cannot end the process: `sys.exit()` in it counts as an error like any exception. Threads that it starts in its
+constructor or in a call are daemons unless it says otherwise, for they are started in one.
 """
 
 from __future__ import annotations
@@ -53,7 +53,7 @@ class Attempted(ModelWrapper):
 
     Args:
         model: what is asked.
-        deadline: seconds that a call may take; `math.inf` waits for ever. A model that is handed the simulator is asked
+        deadline: seconds that a call may take; `math.inf` waits for ever. A model that is given the simulator is asked
             in the caller's own thread, without a deadline: a graphics context belongs to the thread that made it.
     """
 
@@ -146,7 +146,7 @@ def make_model(what: Any, deadline: float = DEADLINE, **options: Any) -> WorldMo
     """Make a world model as `wiw.world_model` does, within a deadline; None for "none".
 
     A model whose class declares published weights (`requires.weights`) has no deadline: fetching them the first time
-    may take hours, and whoever fetches them has timeouts of their own.
+    may take hours, and the library that fetches them has its own timeouts.
 
     Raises:
         RegistryError: unknown name, or options that do not fit.
@@ -168,8 +168,8 @@ def make_model(what: Any, deadline: float = DEADLINE, **options: Any) -> WorldMo
     except LateError as error:
         name = what if isinstance(what, str) else getattr(what, "__qualname__", repr(what))
         raise ConstructionError(
-            f"world model '{name}' cannot be made: its constructor did not return within {deadline:g} s (deadline). "
-            "Does it wait for a download, a lock, a server or a prompt? If it is only slow, give a longer deadline",
+            f"world model '{name}' cannot be built: its constructor did not return within {deadline:g} s (deadline). "
+            "Is it waiting for a download, a lock, a server or a prompt? If it is just slow, give a longer deadline",
             "deadline",
         ) from error
     return made
@@ -183,7 +183,7 @@ def _catch_exit(work: Callable[[], Any]) -> Any:
         if isinstance(error, Exception) or is_stop_request(error):
             raise
         raise ExitError(
-            f"{error!r}, as if to end the process; a model that cannot answer raises an Exception"
+            f"{error!r}, as if to end the process; a model that cannot answer should raise an Exception"
         ) from error
 
 

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The numbers of an agent's search, as the paper names them."""
+"""The parameters of an agent's search, named as in the paper."""
 
 from __future__ import annotations
 
@@ -18,36 +18,36 @@ DESCRIBED = ("candidates", "horizon", "execute", "depth", "width")
 
 @dataclass(frozen=True, kw_only=True)
 class PlanConfig:
-    """Numbers of the search but for how many plans it considers, which `wiw scale` varies."""
+    """Parameters of the search, except the number of plans it considers, which `wiw scale` varies."""
 
     horizon: Annotated[int | None, arg(metavar="L")] = None
-    """L, primitives or poses per plan; the task's own number if not given, 5 without a task. As many of them
-    are carried out as of the task's own, unless the plan is shorter."""
+    """L, primitives or poses per plan. Default: the task's; 5 without a task. Does not change how many actions are
+    executed per decision, unless plans become shorter than that."""
     execute: Annotated[int | None, arg(metavar="N")] = None
-    """Actions carried out before the next decision; 0: the whole plan; negative: all of the plan's first `horizon` but
-    that many, at least one. L - 2 without a task."""
+    """Actions executed before the next decision; 0: the whole plan; negative: all of the plan's first `horizon` except
+    that many, but at least one. Default: the task's; L - 2 without a task."""
     depth: Annotated[int, arg(metavar="N")] = 1
-    """Levels of the beam search. The first chooses among the proposals; each further one extends the best plans by
-    `horizon` actions, as `Policy.extend` proposes from their imagined ends."""
+    """Levels of the beam search. The first chooses among the proposals; each further level extends the best plans by
+    `horizon` actions, proposed by `Policy.extend` from their imagined ends."""
     width: Annotated[int | None, arg(metavar="N")] = None
-    """Plans of an episode that are kept and extended at each level; None means `candidates`."""
+    """Plans per episode that are kept and extended at each level. Default: `candidates`."""
     space: Annotated[str | None, Suppress] = None
-    """Plan space (`wiw.loop.plan_space`); None means the task's, else the policy's."""
+    """Plan space (`wiw.loop.plan_space`). Default: the task's, or else the policy's."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class AgentConfig(PlanConfig):
-    """Numbers of the search; None leaves one to the task, and without a task to the paper's ImageNav.
+    """Parameters of the search. None takes the task's value, or without a task that of the paper's ImageNav.
 
     Raises:
         ArgumentError: a number out of range.
     """
 
     candidates: Annotated[int | None, arg(metavar="M")] = None
-    """M, plans imagined at each decision; the task's own number if not given, 3 without a task."""
+    """M, plans imagined at each decision. Default: the task's; 3 without a task."""
     pool: Annotated[int | None, arg(metavar="N")] = None
-    """Plans that are proposed, of which the first `candidates` are kept, so that the sets of agents that differ in
-    `candidates` alone are nested; None proposes as many as are kept."""
+    """Plans to propose, of which the first `candidates` are kept, so that agents that differ only in `candidates` have
+    nested sets of plans. Default: `candidates`."""
 
     def __post_init__(self) -> None:
         for name in ("candidates", "horizon", "depth", "width", "pool"):
@@ -66,10 +66,10 @@ class AgentConfig(PlanConfig):
             )
 
     def resolve(self, defaults: Mapping[str, Any]) -> AgentConfig:
-        """Return the numbers that a run uses, with a task's `defaults` where this config leaves one open.
+        """Return the parameters that a run uses, with a task's `defaults` for those that this config leaves open.
 
-        Another horizon does not change how many actions are carried out, and so an episode's budget, unless it is
-        shorter than that.
+        Changing the horizon does not change how many actions are executed, and so an episode's budget, unless plans
+        become shorter than that.
         """
         open_names = {name for name, value in self.numbers.items() if value is None}
         taken = {name: value for name, value in defaults.items() if name in open_names}
@@ -78,7 +78,7 @@ class AgentConfig(PlanConfig):
         return replace(self, **taken)
 
     def complete(self) -> AgentConfig:
-        """Return the config with every number set, those that are still open as in the paper's ImageNav."""
+        """Return the config with every parameter set; those still open are as in the paper's ImageNav."""
         candidates = self.candidates or 3
         horizon = self.horizon or 5
         execute = max(1, horizon - 2) if self.execute is None else self.execute
@@ -92,17 +92,17 @@ class AgentConfig(PlanConfig):
 
     @property
     def longest(self) -> int:
-        """Most actions of a plan; for a complete config."""
+        """Maximum number of actions in a plan; for a complete config."""
         return (self.horizon or 1) * self.depth
 
     def describe(self) -> dict[str, int]:
-        """Return the numbers that a run's manifest names: those of a complete config, and a pool that is given."""
+        """Return the parameters stored in a run's manifest: those of a complete config, and the pool if given."""
         complete = self.complete()
         numbers = {name: getattr(complete, name) for name in DESCRIBED}
         return numbers if self.pool is None else {**numbers, "pool": self.pool}
 
     def count_executed(self, length: int) -> int:
-        """Return how many actions of a plan of `length` are carried out; for a complete config."""
+        """Return how many actions of a plan of `length` are executed; for a complete config."""
         assert self.execute is not None and self.horizon is not None
         if self.execute > 0:
             return min(self.execute, length)
@@ -110,10 +110,10 @@ class AgentConfig(PlanConfig):
 
 
 def set_numbers(config: AgentConfig, numbers: Mapping[str, Any]) -> AgentConfig:
-    """Return the config with some numbers in place of its own.
+    """Return the config with some parameters replaced.
 
     Raises:
-        ArgumentError: a name that is no number of the search.
+        ArgumentError: a name that is not a parameter of the search.
     """
     require_known(numbers, [field.name for field in fields(AgentConfig)], "agent", "option")
     return replace(config, **numbers)

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from wiw.errors import ArgumentError, ContractError
 from wiw.policies.base import Policy, Situation
-from wiw.types import Answer, Goal, Proposal, TextAnswer
+from wiw.types import Answer, ArmObservation, Goal, Proposal, TextAnswer
 from wiw.world_models.base import WorldModel
 from wiw.world_models.oracle import Oracle
 
@@ -29,14 +29,14 @@ def check_observations(needs: Collection[str], observations: Sequence[Any]) -> N
     Raises:
         ArgumentError: an observation lacks one of them.
     """
-    if "wrist" in needs and any(getattr(observation, "wrist", None) is None for observation in observations):
+    if "wrist" in needs and not all(isinstance(each, ArmObservation) and each.wrist for each in observations):
         raise ArgumentError(
-            "this agent needs the view of the wrist camera, and got an observation without: make the environment of "
-            "manipulation with cameras=('wrist',)"
+            "this agent needs the wrist camera's view, but got an observation without one: create the manipulation "
+            "environment with cameras=('wrist',)"
         )
     if "depth" in needs and any(observation.depth is None for observation in observations):
         raise ArgumentError(
-            "this agent needs observations with depth, and got one without: make the environment with depth=True"
+            "this agent needs observations with depth, but got one without: create the environment with depth=True"
         )
 
 
@@ -57,11 +57,11 @@ def check_needs(model: WorldModel) -> None:
     """Check that no model but the oracle needs the simulator.
 
     Raises:
-        ArgumentError: another model asks for it.
+        ArgumentError: another model requires it.
     """
     if "simulator" in model.accepts.needs and not isinstance(model.unwrapped, Oracle):
         raise ArgumentError(
-            f"{type(model.unwrapped).__name__} needs the simulator, which is handed to the oracle alone: it knows "
+            f"{type(model.unwrapped).__name__} needs the simulator, which only the oracle is given, because it knows "
             "where the agent truly is. Declare what the model sees of the world instead (needs=('depth',)), or derive "
             "it from wiw's Oracle"
         )
@@ -111,12 +111,12 @@ def check_scores(policy: Policy, scores: Any, proposals: Sequence[Sequence[Propo
     found = [np.asarray(row, np.float64) for row in scores]
     for row, plans in zip(found, proposals, strict=True):
         if row.shape != (len(plans),) or not np.isfinite(row).all():
-            raise ContractError(f"{name}: expected {len(plans)} finite numbers, one a plan, got {row.tolist()}")
+            raise ContractError(f"{name}: expected {len(plans)} finite numbers, one per plan, got {row.tolist()}")
     return found
 
 
 def check_answerer(policy: Policy, goal: Goal) -> None:
-    """Refuse a reviser that gives no answer where the goal asks for one.
+    """Refuse a reviser that gives no answer where the goal requires one.
 
     Raises:
         ContractError: it has not written `answer`.
@@ -125,7 +125,7 @@ def check_answerer(policy: Policy, goal: Goal) -> None:
         what = f"one of {len(goal.choices)} choices" if goal.choices else "one in words"
         raise ContractError(
             f"{type(policy.unwrapped).__name__} gives no answer, but task '{goal.task}' asks for {what} at every "
-            "decision; write its `answer`, or give the agent a policy that answers (reviser=)"
+            "decision; implement its `answer`, or give the agent a policy that answers (reviser=)"
         )
 
 
@@ -135,7 +135,7 @@ def check_answers(policy: Policy, answers: Any, situations: Sequence[Situation])
     That is a distribution over the goal's choices, or a text where the goal is a question.
 
     Raises:
-        ContractError: another kind of answer, other choices, or numbers that are no probabilities.
+        ContractError: another kind of answer, other choices, or numbers that are not probabilities.
     """
     name = f"{type(policy.unwrapped).__name__}.answer"
     if not isinstance(answers, Sequence) or len(answers) != len(situations):
@@ -152,11 +152,11 @@ def check_pictures(policy: Policy, pictures: Any) -> dict[str, NDArray[np.uint8]
     """Return the pictures of a policy, uint8 [H, W, 3] by name.
 
     Raises:
-        ContractError: an array of another shape, or a name that is no identifier.
+        ContractError: an array of another shape, or a name that is not an identifier.
     """
     name = f"{type(policy.unwrapped).__name__}.draw"
     if not isinstance(pictures, Mapping):
-        raise ContractError(f"{name}: expected pictures by name, got {type(pictures).__name__}")
+        raise ContractError(f"{name}: expected a mapping from names to images, got {type(pictures).__name__}")
     for title, picture in pictures.items():
         if not isinstance(title, str) or not title.isidentifier():
             raise ContractError(f"{name}: expected names of letters, digits and underscores, got {title!r}")
@@ -179,7 +179,7 @@ def _check_choice(name: str, answer: Any, choices: tuple[str, ...]) -> None:
 
 def _check_text_answer(name: str, answer: Any) -> None:
     if not isinstance(answer, TextAnswer) or not isinstance(answer.text, str):
-        raise ContractError(f"{name}: expected a TextAnswer, for the goal is a question, got {answer!r}")
+        raise ContractError(f"{name}: expected a TextAnswer, as the goal is a question, got {answer!r}")
     if not 0 <= answer.confidence <= 1:
         raise ContractError(f"{name}: expected a confidence from 0 to 1, got {answer.confidence!r}")
     if answer.final and not answer.text.strip():

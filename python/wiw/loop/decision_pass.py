@@ -39,7 +39,7 @@ class AgentParts:
 
     @property
     def frames(self) -> FrameSpec:
-        """How imagined frames are looked at."""
+        """How imagined frames are used."""
         return choose_frames(self.policy, self.reviser, self.config)
 
     @property
@@ -71,10 +71,10 @@ class AgentParts:
 
 
 def choose_frames(policy: Policy, reviser: Policy, config: AgentConfig) -> FrameSpec:
-    """Return the frames that the reviser asks for.
+    """Return the frames that the reviser requests.
 
-    In a search of several levels the proposer looks at imagined ends as it looks at the world: only what is enough for
-    both is enough.
+    In a search of several levels the proposer looks at imagined ends as it looks at the world: only frames that suffice
+    for both suffice.
     """
     frames = reviser.frames
     sources = [frames.source_size, *([policy.frames.source_size] if (config.depth or 1) > 1 else [])]

@@ -39,13 +39,13 @@ class GripperPoses(PlanSpace):
         check_plan_space(model, GRIPPER_POSES, self.words)
         if accepts.control not in ("image", "text", "action"):
             raise ArgumentError(
-                f"{name} follows a {accepts.control} of the camera, but poses of a gripper move none; declare "
+                f"{name} follows a camera {accepts.control}, but gripper poses do not move the camera; declare "
                 "control='action' to be given the poses, or 'text' or 'image'"
             )
         if accepts.view != "perspective":
-            raise ArgumentError(f"{name} imagines panoramas, but what a gripper does is seen in a front view")
+            raise ArgumentError(f"{name} imagines panoramas, but manipulation is seen in a front view")
         if "semantic" in accepts.needs:
-            raise ArgumentError(f"{name} needs semantics of a panorama, and a gripper's camera shows none")
+            raise ArgumentError(f"{name} needs semantics of a panorama, but the manipulation camera has none")
         check_needs(model)
 
     def imagine(self, model: WorldModel, request: Request) -> Imagination:

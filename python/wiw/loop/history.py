@@ -52,9 +52,9 @@ class EpisodeHistories:
         self._moments: dict[tuple[int, int], list[_Moment]] = {}
 
     def add(self, situations: Sequence[Any]) -> list[tuple[Frame, ...] | None]:
-        """Add each episode's observation to those before, and return the latest of each; None where none are needed.
+        """Add each episode's observation to those before, and return the latest of each; None if none are needed.
 
-        Decision 0 begins an episode anew; a decision that is asked for again replaces what it has added.
+        Decision 0 begins an episode anew; a repeated decision replaces what it added before.
         """
         if self._accepts is None:
             return [None] * len(situations)

@@ -2,7 +2,7 @@
 """Requests to imagine plans, and their results.
 
 An `Imaginer` is a world model as the loop asks it: `ModelImaginer` asks the model for the very plans from the very
-observations. Experiments wrap one to ask for something else (`wiw.experiments`).
+observations. Experiments wrap one to request something else (`wiw.experiments`).
 """
 
 from __future__ import annotations
@@ -64,14 +64,14 @@ class Imagination(ABC):
     rollouts: Sequence[Sequence[Rollout] | None]
     """[episode][candidate]; None for an episode of which nothing was imagined."""
     costs: Sequence[Mapping[str, int]]
-    """What each episode asked for: consultations, rows and frames."""
+    """What each episode requested: consultations, rows and frames."""
     view: View = "perspective"
     """That the model imagines."""
     source_size: tuple[int, int] | None = None
-    """(height, width) that a model of a range of sizes was asked for; None of a model of one size."""
+    """(height, width) requested from a model with a range of sizes; None for a model with only one size."""
     pose_errors: Sequence[NDArray[np.float64] | None] | None = None
-    """float64 [M, 2] by episode, metres and degrees: how far from their places each plan's frames were taken, in the
-    mean; NaN for a plan without imagined frames. None where nobody knows, as for most models."""
+    """float64 [M, 2] by episode, metres and degrees: how far from their places each plan's frames were taken, on
+    average; NaN for a plan without imagined frames. None if nobody knows, as for most models."""
 
     @abstractmethod
     def show(self, frames: FrameSpec) -> list[list[Rollout]]:

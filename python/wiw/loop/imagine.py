@@ -21,7 +21,7 @@ from wiw.types import Conditioning, Control, Key, Observation, Rollout, View
 from wiw.world_models.base import Accepts, WorldModel, ask
 
 NO_SEMANTICS = (
-    "needs semantics: choose a source of them, --semantics simulator or --semantics rednet "
+    "needs semantics: choose a source with --semantics simulator or --semantics rednet "
     "(wiw.experiments.semantics.Labelled); see docs/perception.md"
 )
 
@@ -93,7 +93,7 @@ def imagine_primitives(model: WorldModel, request: Request) -> ImaginedPrimitive
 def _show(
     batch: Any, panoramas: Sequence[NDArray[np.uint8]], answers: list[NDArray[np.uint8]], kind: View, frames: FrameSpec
 ) -> list[list[Rollout]]:
-    """Rollouts in the views that are asked for, or in the front view where the model gives no other."""
+    """Rollouts in the views that are requested, or in the front view where the model gives no other."""
     view = "front" if kind == "perspective" else frames.view
     size = frames.size if view == frames.view else (384, 384)
     shown = batch.views(panoramas, answers, view_maker(view, size), kind)
@@ -125,7 +125,7 @@ def _build_conditioning(accepts: Accepts, batch: Any, inputs: Sequence[ModelInpu
 
 
 def _label_starts(accepts: Accepts, batch: Any, inputs: Sequence[ModelInput]) -> NDArray[np.uint32]:
-    """Return the labels of what each row begins with, none of them blended.
+    """Return the labels at the start of each row, without blending.
 
     Raises:
         ArgumentError: an episode has none.
@@ -170,8 +170,8 @@ def _require_own_memory(found: NDArray[np.uint8], before: Sequence[NDArray[np.ui
     """Return the answer, if it lies elsewhere than those of earlier calls, which are still to be read."""
     if any(np.may_share_memory(found, answer) for answer in before):
         raise ContractError(
-            f"{type(model.unwrapped).__name__}.rollout: gave the memory of an earlier answer, whose frames are lost by "
-            "that; return a new array from every call",
+            f"{type(model.unwrapped).__name__}.rollout: returned the memory of an earlier answer, whose frames are "
+            "overwritten by that; return a new array from every call",
             "memory",
         )
     return found
@@ -221,7 +221,7 @@ def list_depths(inputs: Sequence[ModelInput]) -> list[NDArray[np.float32]]:
     """
     depths = [own.observation.depth for own in inputs]
     if any(value is None for value in depths):
-        raise ArgumentError("the world model needs depth: make the environment with depth=True")
+        raise ArgumentError("the world model needs depth: create the environment with depth=True")
     return depths
 
 

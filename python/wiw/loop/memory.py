@@ -20,7 +20,7 @@ from wiw.world_models.base import Accepts
 
 @dataclass(frozen=True)
 class Query:
-    """One live episode that asks for a decision: what an agent may know of it."""
+    """One live episode that is due for a decision: what an agent may know of it."""
 
     observation: Observation | ArmObservation
     goal: Goal
@@ -41,7 +41,7 @@ def read_observation(observation: Any) -> Observation | ArmObservation:
     if not isinstance(observation, dict):
         return observation
     if "pose" in observation:
-        raise ArgumentError("decide: this dict does not say where things are; pass env.unwrapped.observation")
+        raise ArgumentError("decide: this dict lacks the poses that an agent needs; pass env.unwrapped.observation")
     if "panorama_box" in observation:
         raise ArgumentError("decide: these images have the target's box drawn on them; pass env.observation")
     return Observation(**observation)
@@ -64,7 +64,7 @@ class EpisodeMemories:
     Args:
         policy: that proposes.
         reviser: that scores.
-        accepts: declaration of the world model, in the size that it is asked for; None without one.
+        accepts: declaration of the world model, in the size requested from it; None without one.
     """
 
     def __init__(self, policy: Policy, reviser: Policy, accepts: Accepts | None) -> None:

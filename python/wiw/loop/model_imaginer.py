@@ -12,7 +12,7 @@ from wiw.world_models.base import WorldModel
 
 
 class ModelImaginer(Imaginer, Privileged):
-    """A world model as the loop asks it; the oracle is handed forks of the live environments."""
+    """A world model as the loop asks it; the oracle is given forks of the live environments."""
 
     def __init__(self, model: WorldModel) -> None:
         self._model = model
@@ -24,7 +24,7 @@ class ModelImaginer(Imaginer, Privileged):
         return self._model
 
     def grant(self, environments: LiveEnvironments) -> None:
-        """Take the environments, of which only the oracle is handed forks."""
+        """Take the environments, of which only the oracle is given forks."""
         self._environments = environments
 
     def imagine(self, request: Request) -> Imagination:

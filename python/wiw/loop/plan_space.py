@@ -35,7 +35,7 @@ class PlanSpace(ABC):
             longest: most actions.
 
         Raises:
-            ContractError: it is no plan of this space, or too long.
+            ContractError: it is not a plan of this space, or too long.
         """
 
     @abstractmethod
@@ -56,7 +56,9 @@ class PlanSpace(ABC):
         Raises:
             ArgumentError: they cannot.
         """
-        raise ArgumentError(f"Agent: depth={depth} proposes from imagined places, but {self.words} lead to none")
+        raise ArgumentError(
+            f"Agent: depth={depth} proposes plans from imagined places, but {self.words} do not lead to other places"
+        )
 
 
 def plan_space(space: Any) -> PlanSpace:

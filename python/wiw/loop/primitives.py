@@ -35,7 +35,7 @@ class Primitives(PlanSpace):
         return plan.astype(np.int8)
 
     def check_model(self, model: WorldModel, longest: int) -> None:
-        """See `PlanSpace.check_model`; a model that needs more than an image cannot go on from an imagined frame."""
+        """See `PlanSpace.check_model`; a model that needs more than an image cannot continue from an imagined frame."""
         accepts, name = model.accepts, type(model.unwrapped).__name__
         check_plan_space(model, PRIMITIVES, self.words)
         check_needs(model)
@@ -55,12 +55,12 @@ class Primitives(PlanSpace):
         """See `PlanSpace.check_search`: the model must show panoramas, and the policy must do without depth there."""
         if model.accepts.view != "panorama":
             raise ArgumentError(
-                f"Agent: depth={depth} proposes from imagined panoramas, but {type(model.unwrapped).__name__} imagines "
-                "the front view alone; use depth=1, or a panorama model"
+                f"Agent: depth={depth} proposes plans from imagined panoramas, but {type(model.unwrapped).__name__} "
+                "only imagines the front view; use depth=1, or a panorama model"
             )
         if not policy.can_extend:
             raise ArgumentError(
-                f"Agent: with depth={depth} plans are proposed from imagined places, which have no depth, but "
-                f"{type(policy.unwrapped).__name__} needs it; write its `extend`, or propose with another policy and "
-                "give this one as reviser="
+                f"Agent: with depth={depth} plans are proposed from imagined places, which have no depth images, but "
+                f"{type(policy.unwrapped).__name__} needs them; implement its `extend`, or propose with another policy "
+                "and give this one as reviser="
             )

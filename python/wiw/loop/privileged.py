@@ -30,7 +30,7 @@ class LiveEnvironments:
         self._by_episode.pop((key.seed, key.episode), None)
 
     def find(self, key: Key) -> Any:
-        """Return the environment of an episode, as it stands.
+        """Return the environment of an episode in its current state.
 
         Raises:
             ArgumentError: nobody has granted it.
@@ -38,7 +38,7 @@ class LiveEnvironments:
         env = self._by_episode.get((key.seed, key.episode))
         if env is None:
             raise ArgumentError(
-                "this agent has parts that need the simulator (the oracle, ground truth, fidelity): run it by "
+                "this agent has parts that need the simulator (the oracle, ground truth, fidelity): run it with "
                 "wiw.evaluate, or pass the environment's fork: decide(..., simulator=env.fork())"
             )
         return env
@@ -49,7 +49,7 @@ class Privileged(ABC):
 
     @abstractmethod
     def grant(self, environments: LiveEnvironments) -> None:
-        """Take the environments that the episodes to come are run in."""
+        """Take the environments in which the next episodes are run."""
 
 
 class ForkedEnvironment:

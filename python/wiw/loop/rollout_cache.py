@@ -74,7 +74,7 @@ class RolloutCache:
         except (FileNotFoundError, NotADirectoryError):
             return False
         except (OSError, ValueError) as error:
-            _log.warning("cached rollout %s is damaged (%s); it is dropped and imagined anew", path, error)
+            _log.warning("cached rollout %s is damaged (%s); it is dropped and imagined again", path, error)
             with suppress(OSError):
                 path.unlink()
             return False
@@ -102,7 +102,9 @@ class RolloutCache:
             with suppress(OSError):
                 draft.unlink(missing_ok=True)
             self._writing = False
-            _log.warning("rollouts are no longer cached: %s; free disk space or set another folder by --cache", error)
+            _log.warning(
+                "rollouts are no longer cached: %s; free some disk space or choose another folder with --cache", error
+            )
             return
         self._written += size
         if self._known is None or self._known + self._written > self.budget or self._written > self.budget // 20:
@@ -115,10 +117,10 @@ class RolloutCache:
         """Read a file's frames; raise ValueError where it is not what was written."""
         header = file.read(_HEADER.size)
         if len(header) != _HEADER.size or zlib.crc32(header[:-4]) != _HEADER.unpack(header)[-1]:
-            raise ValueError("its header is cut off or altered")
+            raise ValueError("its header is truncated or altered")
         magic, begin, count, height, width, checksum, _ = _HEADER.unpack(header)
         if magic != _MAGIC or os.fstat(file.fileno()).st_size != _HEADER.size + count * height * width * _CHANNELS:
-            raise ValueError("it has another size than it was written with")
+            raise ValueError("its size differs from what was written")
         if begin > first or begin + count != first + len(frames) or (height, width) != frames.shape[1:3]:
             return False
         data = frames if begin == first else np.empty((count, height, width, _CHANNELS), np.uint8)
@@ -202,7 +204,7 @@ class Cached(ModelWrapper):
 def cache_rollouts(model: WorldModel, cache: str | Path = "auto", budget_gb: float = BUDGET_GB) -> WorldModel:
     """Return the model behind a cache: with "auto" if it is `cacheable`, never with "off", else in a folder.
 
-    A model that is handed the simulator is never cached: its answer depends on a whole scene, which no key can hold.
+    A model that is given the simulator is never cached: its answer depends on a whole scene, which no key can hold.
     Nor is one without a `version`, for nobody could tell when its answers change: a warning names it.
     """
     accepts = model.accepts
@@ -218,8 +220,8 @@ def cache_rollouts(model: WorldModel, cache: str | Path = "auto", budget_gb: flo
 def _warn_unversioned(name: str) -> None:
     """Say once in a process that a model is not cached."""
     _log.warning(
-        "rollouts of %s are not cached: it declares no version. Give the class one, as `version = '1'`, and raise it "
-        "whenever its answers change; or leave the cache off",
+        "rollouts of %s are not cached: it declares no version. Give the class one, such as `version = '1'`, and "
+        "change it whenever its answers change; or leave the cache off",
         name,
     )
 

@@ -70,9 +70,16 @@ class LiveEpisode:
 
 
 def _open_environment(task: Any, needs: Collection[str]) -> Any:
-    """Return an environment whose observations have what an agent needs."""
-    cameras = {"cameras": ("wrist",)} if "wrist" in needs else {}
-    return task.environment(depth="depth" in needs, **cameras)
+    """Return an environment whose observations have what an agent needs.
+
+    Raises:
+        ArgumentError: the agent needs the view of a wrist camera, and the task has no cameras.
+    """
+    if "wrist" not in needs:
+        return task.environment(depth="depth" in needs)
+    if "cameras" not in task.sensor_options:
+        raise ArgumentError(f"this agent needs the view of a wrist camera, which task '{task.name}' does not have")
+    return task.environment(depth="depth" in needs, cameras=("wrist",))
 
 
 def run_episodes(
@@ -91,10 +98,10 @@ def run_episodes(
     Keys are made of seed and salt (`wiw.loop.keys`). Policies draw what they believe in the episodes whose index is in
     `pictured`.
 
-    An exception in an episode is infrastructure: the episode is recorded as an error and the rest go on. One in a batch
-    may be due to any of its episodes, so each of them is run again by itself, after the others: what breaks does not
-    depend on what else was live. A policy's broken contract or a wrong argument would hit every episode alike, so it is
-    raised; so is what the sink raises.
+    An exception in an episode is infrastructure: the episode is recorded as an error and the rest continue. One in a
+    batch may be due to any of its episodes, so each of them is run again on its own, after the others: what breaks does
+    not depend on what else was live. A policy's broken contract or a wrong argument would hit every episode alike, so
+    it is raised; so is what the sink raises.
     """
     waiting, running, suspects = deque(episodes), list[LiveEpisode](), deque[tuple[int, Episode]]()
     envs = [_open_environment(task, agent.needs) for _ in range(min(live, len(episodes)))]

@@ -2,9 +2,9 @@
 """Policy-guided beam search, level by level (paper, "Unified Strategy for Closed-Loop Online Planning").
 
 The first level's candidates are the proposals. Deeper ones extend the best of them from where imagination says that
-they end. Every level imagines whole plans from the real observation, so a model needs nothing of an imagined frame,
-neither depth nor a simulator, and errors do not add up over cuts; the common beginnings of a causal model's plans are
-imagined once.
+they end. Every level imagines whole plans from the real observation, so a model never has to continue from an imagined
+frame, which has neither depth nor a simulator, and errors do not add up over cuts; the common beginnings of a causal
+model's plans are imagined once.
 """
 
 from __future__ import annotations

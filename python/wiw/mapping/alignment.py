@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""How a home is turned: the direction of its walls, which maps are aligned with.
+"""Orientation of a home: the direction of its walls, which maps are aligned with.
 
 Homes have right angles (the Manhattan world of Coughlan and Yuille, 1999), and an agent may start with any heading.
 """

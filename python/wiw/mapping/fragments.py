@@ -54,7 +54,7 @@ class Fragments:
     """The fragments of one observation, numbered from 1 on; row 0 of each array belongs to none."""
 
     index: NDArray[np.int32]
-    """int32 [4, H, W]: the fragment of each pixel, 0 where there is none."""
+    """int32 [4, H, W]: the fragment of each pixel, 0 if there is none."""
     view: NDArray[np.int64]
     category: NDArray[np.int64]
     pixels: NDArray[np.int64]

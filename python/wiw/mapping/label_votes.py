@@ -56,7 +56,7 @@ class LabelVotes:
         return np.asarray(found, np.float64)
 
     def measure_shares(self, voxels: NDArray[np.int64], category: int) -> NDArray[np.float64]:
-        """Return the share of each voxel's votes that a category has, float64 [N]; 1 where there are no votes.
+        """Return the share of each voxel's votes that a category has, float64 [N]; 1 if there are no votes.
 
         Args:
             voxels: keys, see `wiw.mapping.fragments.pack_voxels`.

@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """Set-of-Marks: each landmark outlined in the views and numbered, so that a model can name it by its number.
 
-The numbers stand at the innermost point of each landmark. They never overlap each other, and they hide nothing of the
+The numbers stand at the innermost point of each landmark. They never overlap each other, and they do not hide the
 landmarks that a question asks about as long as there is room elsewhere.
 """
 
@@ -67,7 +67,7 @@ def draw_marks(images: NDArray[np.uint8], landmarks: Sequence[Landmark], asked: 
 
 
 def place_labels(masks: Mapping[int, NDArray[np.bool_]], spared: Sequence[int] = ()) -> dict[int, LabelBox]:
-    """Return where the number of each mask [H, W] stands: no two overlap, and all lie in the picture.
+    """Return the place of each mask's [H, W] number: no two overlap, and all lie in the picture.
 
     No other number hides anything of the masks in `spared`, as long as there is room elsewhere. A mask whose number
     fits nowhere is left out.

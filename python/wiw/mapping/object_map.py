@@ -40,7 +40,7 @@ LEAST_CONFIDENCE = 0.3
 COLOR_PIXELS = 256
 """Pixels at most that a fragment's colour is named from."""
 BACKGROUND = ("", "wall", "floor", "ceiling", "door frame", "unknown", "misc", "other")
-"""Categories that are no things; they are never mapped."""
+"""Categories that are not things; they are never mapped."""
 CONFUSABLE: tuple[frozenset[str], ...] = (
     frozenset({"armchair", "sofa"}),
     frozenset({"chair", "office chair", "dining chair", "armchair"}),
@@ -188,7 +188,7 @@ class ObjectMap:
         return number in self._objects
 
     def add(self, views: Views, labels: Labels, name_color: NameColor | None = None) -> NDArray[np.int32]:
-        """Add one observation; return the object of each pixel, int32 [4, H, W], 0 where there is none.
+        """Add one observation; return the object of each pixel, int32 [4, H, W], 0 if there is none.
 
         Raises:
             ArgumentError: labels that do not fit the views or the categories.
@@ -344,11 +344,6 @@ class ObjectMap:
     def count(self, category: str, least_size: float = 0.0) -> int:
         """Return how many objects of a category there are."""
         return len(self.find(category, least_size))
-
-    def group_by_category(self) -> dict[str, tuple[MapObject, ...]]:
-        """Return the objects of each category, categories in alphabetical order."""
-        names = sorted({thing.category for thing in self.objects})
-        return {name: self.find(name) for name in names}
 
 
 def measure_overlap(one: MapObject, other: MapObject, mutual: bool = False) -> float:

@@ -17,7 +17,6 @@ from wiw.mapping.views import CAMERA_HEIGHT, check_panorama
 
 CELL = 0.1
 """Metres."""
-AGENT_RADIUS = 0.1
 OBSTACLE = (0.1, 1.75)
 """Heights above the floor, in metres, between which a surface is in the agent's way. Its body is 1.5 m high; navigation
 meshes lie, and are rounded, up to 0.2 m higher, so that a lamp that hangs down to 1.7 m stops it."""
@@ -34,7 +33,7 @@ STRIDE = 2
 MARGIN = 8
 """Cells around what is known by which the map grows."""
 LEAST_UNKNOWN = 8
-"""Unknown parts of fewer cells, among known ones, are no frontier's concern."""
+"""Unknown parts of fewer cells among known ones do not make a frontier."""
 LEAST_FRONTIER = 3
 """Cells that a frontier has at least."""
 CEILING_BAND = (0.35, 0.08)

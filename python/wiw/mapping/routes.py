@@ -30,7 +30,7 @@ HEADINGS = round(2 * np.pi / TURN)
 RADIUS = 0.25
 """Metres from its target within which a route ends."""
 TURN_COST = 0.05
-"""Metres that a turn is worth: enough to prefer straight ways, too little for a detour."""
+"""Metres that a turn is worth: enough to prefer straight paths, too little for a detour."""
 START_RADIUS = 0.35
 """Metres around the agent in which it may pass closer to obstacles than it fits: it stands there."""
 NEIGHBOURS = ((0, 1), (1, 0), (1, 1), (1, -1), (1, 2), (2, 1), (2, -1), (1, -2))
@@ -298,7 +298,7 @@ def _is_in_sight(grid: OccupancyGrid, places: NDArray[np.float64], point: NDArra
 
 
 def _distance_field(open_: NDArray[np.bool_], goals: NDArray[np.bool_]) -> NDArray[np.float64]:
-    """Return the metres from each open cell to the nearest goal; inf where there is no way."""
+    """Return the metres from each open cell to the nearest goal; inf if there is no path."""
     rows, columns = np.flatnonzero(open_.any(axis=1)), np.flatnonzero(open_.any(axis=0))
     box = (slice(rows[0], rows[-1] + 1), slice(columns[0], columns[-1] + 1))
     inner = open_[box]

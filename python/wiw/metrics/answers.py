@@ -26,7 +26,7 @@ def aeqa_spl(scores: ArrayLike, shortest: ArrayLike, travelled: ArrayLike, answe
         scores: [N] raw marks; values outside 1 to 5 are clipped.
         shortest: [N] L* in metres, from the start to a viewpoint that affords the answer.
         travelled: [N] L in metres.
-        answered: [N] booleans; where False the agent gave no answer of its own (a blind answer was judged), and the
+        answered: [N] booleans; where False, the agent itself gave no answer (a blind answer was judged), and the
             episode contributes nothing.
 
     Raises:

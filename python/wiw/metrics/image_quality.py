@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
-"""How good an image looks by itself, without a true one beside it: sharpness and colourfulness by formula.
+"""How good an image looks on its own, without a reference image: sharpness and colourfulness by formula.
 
-Both are plain statistics of pixels. They know nothing of what is shown: noise is sharp, and a poster is colourful.
+Both are plain statistics of pixels. They ignore what is shown: noise counts as sharp, and a poster as colourful.
 """
 
 from __future__ import annotations

@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
 """LPIPS, the perceptual distance of Zhang et al. 2018, version 0.1 on AlexNet's features.
 
-Two published files make it what papers call LPIPS; they are identified by their SHA-256. Where they are not there is no
-number: nothing stands in for them.
+Two published files make it what papers call LPIPS; they are identified by their SHA-256. Without them there is no
+value: there is no substitute.
 """
 
 from __future__ import annotations
@@ -61,16 +61,17 @@ def default_folder() -> Path:
 
 
 class Lpips:
-    """Distance of images as AlexNet's features tell it, calibrated by human judgements: 0 for equal ones, no unit.
+    """Distance between images in AlexNet's features, calibrated on human judgements: 0 for equal ones, no unit.
 
-    Made for perspective images: it knows no sphere, so take views of a panorama.
+    Made for perspective images: it is not defined on a sphere, so take views of a panorama.
 
     Args:
         folder: with both files of weights; "auto" is `default_folder()`.
-        device: of torch; "auto" is the GPU where there is one.
+        device: torch device; "auto" is the GPU if there is one.
 
     Raises:
-        WeightsError: a file is not there ("missing"; says where both come from), or another than published ("unfit").
+        WeightsError: a file is missing ("missing"; says where to get both), or differs from the published one
+            ("unfit").
         DependencyError: torch is not installed.
     """
 
@@ -79,7 +80,7 @@ class Lpips:
         self._where, self._weights = _read(self.folder, device)
 
     def __call__(self, a: ArrayLike, b: ArrayLike) -> float | NDArray[np.float64]:
-        """Return distances of uint8 images [..., H, W, 3] from as many others: a float, or float64 [...] for batches.
+        """Return the distances between two sets of uint8 images [..., H, W, 3]: a float, or float64 [...] for batches.
 
         Raises:
             ArgumentError: another type or shape, or images that are too small.
@@ -134,10 +135,10 @@ def _read(folder: Path, device: str) -> tuple[str, dict[str, Any]]:
     absent = [file.name for file in (BACKBONE, HEADS) if not (folder / file.name).is_file()]
     if absent:
         raise WeightsError(
-            f"LPIPS: {' and '.join(absent)} not found in {folder}. It needs two published files there, "
-            f"{BACKBONE.name} ({BACKBONE.size}) and {HEADS.name} ({HEADS.size}, also in the lpips package as "
-            f"lpips/weights/v0.1/{HEADS.name}):\n"
-            f"  curl -L --create-dirs --output-dir {folder} -O {BACKBONE.url} -O {HEADS.url}"
+            f"LPIPS: {' and '.join(absent)} not found in {folder}. It needs two published files there, {BACKBONE.name} "
+            f"({BACKBONE.size}) and {HEADS.name} ({HEADS.size}, also in the lpips package as "
+            f"lpips/weights/v0.1/{HEADS.name}):\n  curl -L --create-dirs --output-dir {folder} -O {BACKBONE.url} -O "
+            f"{HEADS.url}"
         )
     for file in (BACKBONE, HEADS):
         _require_published(folder / file.name, file)

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Metrics: a number per episode and how a run's tables summarise it."""
+"""Metrics: a number per episode, and how a run's tables summarise it."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from wiw.errors import ContractError
 class Metric:
     """One column of a run's tables: the mean of a number over episodes, with its interval.
 
-    A package adds its own by an entry point in "wiw.metrics":
+    A package adds its own with an entry point in "wiw.metrics":
 
         NEAR = wiw.Metric("near", "Near", "rate", True, of=lambda metrics: metrics["distance_to_goal"] < 1.5)
     """
@@ -28,16 +28,16 @@ class Metric:
     """"rate": episode values in [0, 1], shown as percent. "length": any number."""
     higher_is_better: bool
     of: Callable[[Mapping[str, float]], float] | None = None
-    """Computes an episode's value from its other metrics where the task does not measure it; raises KeyError where
-    one that it needs is missing, and then the episode has no value."""
+    """Computes an episode's value from its other metrics if the task does not measure it; raises KeyError if one that
+    it needs is missing, in which case the episode has no value."""
     about: str = ""
     """One line for `wiw list`."""
     least: float = -math.inf
-    """Smallest possible value; intervals of the mean end there."""
+    """Smallest possible value, where intervals of the mean end."""
     paper_name: str = ""
     """Name of the metric in the World-in-World paper, if it differs from the label."""
     partial: bool = False
-    """Whether some episodes have no value; the mean is over those that have one. Others need one of every episode."""
+    """Whether episodes may lack a value, with the mean over those that have one. Otherwise every episode needs one."""
 
     @property
     def scale(self) -> float:
@@ -74,10 +74,10 @@ SUCCESS = Metric("success", "SR", "rate", True, about="Success rate: percent of 
 SPL = Metric("spl", "SPL", "rate", True, about="Success weighted by path length, in percent.")
 SPL_RULE = (
     "SPL: the mean of success * l / max(l, p), as in the paper; p is the path walked, l the shortest path to the goal "
-    "point itself (in primitives instead of metres where the rules say so). Success asks only for its radius, so a "
-    "detour of about that length costs nothing."
+    "point itself (in primitives instead of metres where the rules say so). Success only requires coming within its "
+    "radius, so a detour of about that length costs nothing."
 )
-"""The formula where paths lead to a goal point."""
+"""The formula for paths that lead to a goal point."""
 ANSWER_SCORE = Metric(
     "answer_score", "Score", "rate", True, about="Mean mark of the answers, 1 to 5 mapped to 0 to 100."
 )
@@ -87,7 +87,7 @@ GROUNDED = Metric(
     "Grounded",
     "rate",
     True,
-    about="Percent of episodes in which what is asked about was in sight.",
+    about="Percent of episodes in which the object of the question was in sight.",
     partial=True,
 )
 PATH_LENGTH = Metric(

@@ -20,7 +20,7 @@ def pose_error(a: ArrayLike, b: ArrayLike) -> tuple[NDArray[np.float64], NDArray
         Two float64 [B].
 
     Raises:
-        ArgumentError: a matrix that is no rigid transform, or batches of different length.
+        ArgumentError: a matrix that is not a rigid transform, or batches of different lengths.
     """
     errors = np.asarray(_core.pose_error(np.asarray(a, np.float64), np.asarray(b, np.float64)))
     return errors[:, 0], errors[:, 1]

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Agreement of two orders of the same plans."""
+"""Agreement between two rankings of the same plans."""
 
 from __future__ import annotations
 
@@ -10,9 +10,9 @@ from numpy.typing import NDArray
 
 
 def rank_agreement(scores: NDArray[np.float64], true: NDArray[np.float64]) -> float:
-    """Return Kendall's tau-b of two scorings [N] of the same plans; NaN where all scores of one of them are equal.
+    """Return Kendall's tau-b of two scorings [N] of the same plans; NaN if all scores of one of them are equal.
 
-    By comparing all pairs, as plans are few: `scipy.stats` gives the same, and takes half a second to load in each
+    All pairs are compared, as plans are few: `scipy.stats` gives the same, but takes half a second to load in each
     process of a run.
     """
     if len(scores) < 2 or np.ptp(scores) == 0 or np.ptp(true) == 0:

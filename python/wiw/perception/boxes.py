@@ -43,7 +43,7 @@ def box_width(box: Box, columns: int) -> float:
 
 
 def scale_box(box: Box, scale: float, size: tuple[int, int], wraps: bool = False) -> Box:
-    """Scale the box about its centre, within an image of `size` (H, W); on a panorama it may come to cross the seam.
+    """Scale the box about its centre, within an image of `size` (H, W); on a panorama it may then cross the seam.
 
     A box wider than the panorama becomes the whole of it.
     """

@@ -9,7 +9,7 @@ from numpy.typing import ArrayLike, NDArray
 from wiw.errors import ArgumentError
 
 TEMPERATURE_BOUNDS = (0.05, 20.0)
-"""Least and greatest temperature."""
+"""Minimum and maximum temperature."""
 
 
 def softmax(logits: ArrayLike, temperature: float = 1.0) -> NDArray[np.float64]:

@@ -77,7 +77,7 @@ class ColorNamer:
         """Read the JSON file that `save` wrote.
 
         Raises:
-            WeightsError: there is no such file, or it is damaged or of something else.
+            WeightsError: it does not exist, is damaged, or holds something else.
         """
         try:
             values = json.loads(Path(path).expanduser().read_text())
@@ -87,7 +87,7 @@ class ColorNamer:
             return cls(categories, **{name: np.array(value, np.float64) for name, value in values.items()})
         except (OSError, ValueError, KeyError, TypeError, AttributeError, ArgumentError) as error:
             raise WeightsError(
-                f"{path}: expected parameters of colour naming: {error}; `wiw train perception` makes some",
+                f"{path}: expected parameters for colour naming: {error}; `wiw train perception` creates them",
                 "missing" if isinstance(error, OSError) else "unfit",
             ) from error
 

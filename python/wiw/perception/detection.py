@@ -63,7 +63,7 @@ class Detector(ABC):
         """
         names = list(names)
         if any(not name.strip() for name in names) or len(set(names)) < len(names):
-            raise ArgumentError(f"detect: expected names that differ and are not empty, got {names}")
+            raise ArgumentError(f"detect: expected distinct, non-empty names, got {names}")
         seen, pointed = check_images("detect", images, ids, "ids" in self.needs)
         if not seen or not names:
             return [no_detections() for _ in seen]
@@ -98,7 +98,7 @@ def check_images(
         return seen, []
     if ids is None:
         raise ArgumentError(
-            f"{where}: this one knows the simulator's instance ids only; pass ids=, one [H, W] an image"
+            f"{where}: this one only knows the simulator's instance ids; pass ids=, one [H, W] per image"
         )
     pointed = [np.asarray(array) for array in ids]
     if [array.shape for array in pointed] != [image.shape[:2] for image in seen]:

@@ -42,7 +42,7 @@ class DetectorLabeller(Labeller):
         least_score: float = 0.3,
     ) -> None:
         if any(not name.strip() for name in names) or len(set(names)) < len(names) or not 0 < len(names) < 256:
-            raise ArgumentError(f"DetectorLabeller: expected 1 to 255 names that differ, got {list(names)}")
+            raise ArgumentError(f"DetectorLabeller: expected 1 to 255 distinct names, got {list(names)}")
         self.categories = ("", *names)
         self.detector: Detector = DETECTORS.make(detector)
         self.segmenter: Segmenter = SEGMENTERS.make(segmenter)

@@ -21,7 +21,7 @@ SIDE = 40
 RING = 10
 """Pixels around the target whose corners move with it."""
 CORNERS = 80
-"""Most corners followed."""
+"""Maximum number of corners followed."""
 FEWEST = 6
 """Fewest corners that must agree on one motion ..."""
 AGREEING = 0.25
@@ -31,7 +31,7 @@ RETURN = 2.5
 OUTLIER = 3.0
 """Pixels from the common motion beyond which a corner does not agree."""
 LIKENESS = 0.6
-"""Least correlation between the target where it was seen last, moved, and the frame."""
+"""Minimum correlation between the target where it was seen last, moved, and the frame."""
 LARGEST_SCALE = 2.0
 """Larger changes of size from one frame to the next are mistakes."""
 
@@ -44,7 +44,7 @@ class Flow(FrameTracker):
     (Kalal et al., ICPR 2010), and moves the mask by the similarity that most of them agree on.
 
     Each frame is compared with the one that showed the target last, and then with the seed. Where too few corners agree
-    or the moved target is not like the frame, the target is lost. Nothing is learned, and parts that come into sight
+    or the moved target differs from the frame, the target is lost. Nothing is learned, and parts that come into sight
     are not added to the mask.
     """
 
@@ -66,7 +66,7 @@ class Flow(FrameTracker):
 
 
 def _find_target(image: Grey, mask: Mask, frame: Grey) -> Mask | None:
-    """Return the target's mask in a frame, given that in another image; None where it is lost."""
+    """Return the target's mask in a frame, given that in another image; None if it is lost."""
     near = _dilate(mask)
     start = cv2.goodFeaturesToTrack(image, CORNERS, 0.005, 3, mask=near.astype(np.uint8), blockSize=5)
     if start is None or len(start) < FEWEST or (patch := _find_patch(image, mask, frame)) is None:
@@ -117,7 +117,7 @@ def _follow_corners(image: Grey, frame: Grey, start: Any, guess: Any) -> tuple[N
 
 
 def _move_mask(image: Grey, mask: Mask, frame: Grey, motion: Any) -> Mask | None:
-    """Return the mask, moved; None where it leaves the frame, changes its size much, or the frame is unlike it."""
+    """Return the mask, moved; None if it leaves the frame, changes its size a lot, or differs from the frame."""
     size = frame.shape[::-1]
     moved = np.asarray(cv2.warpAffine(mask.astype(np.uint8) * 255, motion, size)) > 127
     if not moved.any() or not 1 / LARGEST_SCALE < np.hypot(*motion[0, :2]) < LARGEST_SCALE:

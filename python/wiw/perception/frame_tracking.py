@@ -23,8 +23,8 @@ class FrameTracker(Tracker):
     with.
 
     These turns are the real panorama, turned, and so is the target's mask. Imagined frames are followed from the real
-    view after them. A front view that shows nothing of the target is led up to by real views: from the one that faces
-    the target, turn by turn.
+    view after them. A front view without the target is preceded by real views: from the one that faces the target, turn
+    by turn.
     """
 
     follows = "frames"
@@ -49,7 +49,7 @@ class FrameTracker(Tracker):
         panoramic: bool,
         real: Sequence[int],
     ) -> list[NDArray[np.bool_]]:
-        """Follow each plan by itself; a target that is out of sight all around gets empty masks."""
+        """Track the target along each plan separately; masks are empty where it is out of sight all around."""
         follow = self._follow_panoramas if panoramic else self._follow_front_views
         found = []
         for observation, poses, images, count in zip(observations, viewpoints, frames, real, strict=True):

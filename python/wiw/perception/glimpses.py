@@ -88,7 +88,9 @@ def extract_glimpses(
             f"{masks.shape}"
         )
     if np.shape(real) != (len(panoramas),):
-        raise ArgumentError(f"extract_glimpses: expected one flag a panorama [{len(panoramas)}], got {np.shape(real)}")
+        raise ArgumentError(
+            f"extract_glimpses: expected one flag per panorama [{len(panoramas)}], got {np.shape(real)}"
+        )
     frames = np.flatnonzero(masks.any(axis=(1, 2)))
     return join_glimpses([_extract_glimpse(panoramas[k], masks[k], bool(real[k])) for k in frames]), frames
 

@@ -25,7 +25,7 @@ MIN_PIXELS = 3
 
 
 class Growing(Reprojection):
-    """Grows a reprojected mask into the warp's holes by GrabCut (Rother et al., SIGGRAPH 2004).
+    """Grows a reprojected mask into the warp's holes with GrabCut (Rother et al., SIGGRAPH 2004).
 
     Pixels that the observation showed are either in the seed or not the target. Those it did not show, because
     something was in front, may belong to the target if they continue its colours.

@@ -3,7 +3,7 @@
 
 A cell is a square of 2 x 2 pixels of a view in a fixed angular resolution. The network reads its four colours, and its
 direction, so that it serves any field of view: on a level camera the row says how high things are. Depth, where it is
-known, says how large. Inside, the network works on every second cell, and its last layer tells four cells apart.
+known, says how large. Inside, the network works on every second cell, and its last layer predicts four cells each.
 """
 
 from __future__ import annotations
@@ -31,7 +31,7 @@ MULTIPLE = 16
 PIXELS = 2
 """Rows and columns of pixels in a cell."""
 FINE = 2
-"""Rows and columns of cells that each output of the finest level stands for."""
+"""Rows and columns of cells per output of the finest level."""
 FINE_CELLS = FINE**2
 COLOR_CHANNELS = 3 * PIXELS**2
 CHANNELS = COLOR_CHANNELS + 5

@@ -22,10 +22,10 @@ WEIGHTS = Path(__file__).parent / "labeller.safetensors"
 
 
 class LearnedLabeller(Labeller):
-    """A trained network. A view at a time, so that its labels do not depend on the other views of a batch.
+    """A trained network. Views are processed one at a time, so that labels do not depend on the other views of a batch.
 
     Args:
-        weights: a file of `wiw train perception`; None means those that come with wiw.
+        weights: a file of `wiw train perception`; None means those shipped with wiw.
 
     Raises:
         DependencyError: torch or safetensors is not installed.
@@ -140,7 +140,7 @@ def _plan_input(size: tuple[int, int], hfov_deg: float) -> tuple[InputSize, NDAr
 
 
 def _map_pixels(pixels: int, cells: int) -> NDArray[np.intp]:
-    """Return the index of the cell that each pixel lies in, along one side of a view."""
+    """Return the index of each pixel's cell, along one side of a view."""
     return (np.arange(pixels) * cells // pixels).astype(np.intp)
 
 
@@ -155,6 +155,6 @@ def require_torch() -> None:
         import torch  # noqa: F401
     except ImportError as error:
         raise DependencyError(
-            f"the learned labeller needs torch and safetensors ({error}): pip install 'wiw[torch]', or for a CPU alone "
+            f"the learned labeller needs torch and safetensors ({error}): pip install 'wiw[torch]', or for CPU only "
             "pip install torch safetensors --extra-index-url https://download.pytorch.org/whl/cpu"
         ) from error

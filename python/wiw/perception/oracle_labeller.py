@@ -32,7 +32,7 @@ class OracleLabeller(Labeller):
         names = {int(each["id"]): merge_category(each["category"]) for each in instances}
         self.categories = ("", *sorted(set(names.values()))) if categories is None else tuple(categories)
         if self.categories[:1] != ("",) or len(set(self.categories)) != len(self.categories):
-            raise ArgumentError(f"OracleLabeller: expected '' and then names that differ, got {self.categories}")
+            raise ArgumentError(f"OracleLabeller: expected '' followed by distinct names, got {self.categories}")
         if len(self.categories) > 256:
             raise ArgumentError(f"OracleLabeller: expected at most 256 categories, got {len(self.categories)}")
         numbers = {name: i for i, name in enumerate(self.categories)}
@@ -53,8 +53,8 @@ class OracleLabeller(Labeller):
         assert ids is not None
         if ids.size and int(ids.max()) >= len(self._category):
             raise ArgumentError(
-                f"OracleLabeller: expected ids up to {len(self._category) - 1}, got {int(ids.max())}: views of another "
-                "scene than the labeller's"
+                f"OracleLabeller: expected ids up to {len(self._category) - 1}, got {int(ids.max())}: these views are "
+                "of another scene than the labeller's"
             )
         category = self._category[ids]
         return SceneLabels(category, (category > 0).astype(np.float32), self._state[ids])

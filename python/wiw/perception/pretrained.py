@@ -33,7 +33,7 @@ def load_network(loader: str, kinds: Sequence[str], weights: str | Path, revisio
 
     Raises:
         DependencyError: torch or transformers is not installed.
-        WeightsError: there are no such weights, or they belong to another network.
+        WeightsError: the weights do not exist, or belong to another network.
         ArgumentError: a revision was given for a folder.
     """
     transformers = import_transformers()
@@ -92,10 +92,10 @@ def _load(load: Callable[..., Any], weights: str | Path, revision: str | None, *
     folder = Path(weights).expanduser()
     local = folder.is_dir()
     if local and revision is not None:
-        raise ArgumentError(f"revision: '{revision}' names a state of a hub repository, but {folder} is a folder")
+        raise ArgumentError(f"revision: '{revision}' is a revision of a hub repository, but {folder} is a folder")
     if not local and is_path(str(weights)):
         raise WeightsError(
-            f"no folder {folder.resolve()}; give one that save_pretrained wrote, or a name on the Hugging Face hub"
+            f"no folder {folder.resolve()}; give one written by save_pretrained, or a name on the Hugging Face hub"
         )
     try:
         with _silence_transformers():
@@ -104,7 +104,7 @@ def _load(load: Callable[..., Any], weights: str | Path, revision: str | None, *
         if not local:
             raise explain_hub_error(error, str(weights), revision) from error
         first = (str(error).strip().splitlines() or [type(error).__name__])[0]
-        raise WeightsError(f"{folder}: {first}; give a folder that save_pretrained wrote", "unfit") from error
+        raise WeightsError(f"{folder}: {first}; give a folder written by save_pretrained", "unfit") from error
 
 
 @contextmanager

@@ -72,8 +72,8 @@ class Recogniser:
                 weights = {name: file.get_tensor(name).float() for name in file.keys()}  # noqa: SIM118 - it is no mapping
         except (OSError, SafetensorError) as error:
             raise FileError(
-                f"{path}: expected weights of a recogniser (safetensors): {error}; train some with "
-                f"`wiw train recogniser --out {path}`"
+                f"{path}: expected weights of a recogniser (safetensors): {error}; train them with `wiw train "
+                f"recogniser --out {path}`"
             ) from error
         try:
             network = Network(len(header["categories"]), int(header["width"]), bool(header.get("sizes", False)))
@@ -84,8 +84,8 @@ class Recogniser:
             return cls(network, header["categories"], header["temperature"], header["card"])
         except (KeyError, TypeError, ValueError, RuntimeError, ArgumentError) as error:
             raise FileError(
-                f"{path}: header and weights do not make a recogniser ({error}); train it anew with "
-                f"`wiw train recogniser --out {path}`"
+                f"{path}: header and weights do not form a recogniser ({error}); train it again with `wiw train "
+                f"recogniser --out {path}`"
             ) from error
 
     def save(self, path: str | Path) -> None:
@@ -154,8 +154,8 @@ class Recogniser:
         if unknown or not choices:
             raise ArgumentError(
                 f"the recogniser does not know {', '.join(unknown) or 'an empty list of choices'}; it was trained on "
-                f"{', '.join(self.categories)}: choose among these (categories=[...]), or train another with "
-                "`wiw train recogniser`"
+                f"{', '.join(self.categories)}: choose from these (categories=[...]), or train another with `wiw train "
+                "recogniser`"
             )
         return [self.categories.index(name) for name in choices]
 
@@ -167,8 +167,8 @@ def require_torch() -> None:
         import torch  # noqa: F401
     except ImportError as error:
         raise BackendError(
-            f"the recogniser needs torch and safetensors ({error}): pip install 'wiw[torch]', or for a CPU alone "
-            "pip install torch safetensors --extra-index-url https://download.pytorch.org/whl/cpu"
+            f"the recogniser needs torch and safetensors ({error}): pip install 'wiw[torch]', or for CPU only pip "
+            "install torch safetensors --extra-index-url https://download.pytorch.org/whl/cpu"
         ) from error
 
 
@@ -181,7 +181,7 @@ def _parse_header(metadata: Mapping[str, str] | None, path: str | Path) -> dict[
     try:
         header = json.loads(metadata["header"])
     except (KeyError, ValueError) as error:
-        raise FileError(f"{path}: its header cannot be read ({error}); train it anew") from error
+        raise FileError(f"{path}: its header cannot be read ({error}); train it again") from error
     if not isinstance(header, dict):
-        raise FileError(f"{path}: expected an object as its header, got {type(header).__name__}; train it anew")
+        raise FileError(f"{path}: expected an object as its header, got {type(header).__name__}; train it again")
     return header

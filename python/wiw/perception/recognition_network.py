@@ -40,8 +40,8 @@ def to_network_input(images: Tensor, boxes: Tensor) -> Tensor:
 def estimate_sizes(scalars: Tensor) -> Tensor:
     """Return sizes of targets in metres, as if their lower edges were on the floor: float [N, 3], from [N, 5].
 
-    Logarithms of distance and width, and the height of the upper edge. What stands on something else, or whose lower
-    edge is hidden, is taken for farther away, likewise in training.
+    Logarithms of distance and width, and the height of the upper edge. Objects that stand on something else, or whose
+    lower edge is hidden, are taken to be farther away, in training too.
     """
     width, _, upper, lower, _ = scalars.unbind(dim=1)
     distance = (CAMERA_HEIGHT / torch.tan(-lower).clamp_min(CAMERA_HEIGHT / FARTHEST)).clamp_min(0.1)
@@ -60,13 +60,13 @@ class Network(nn.Module):
     """Logits of N glimpses by a small convolutional network, and their sums by learned weights.
 
     The sum over a set's glimpses v is  sum(w_v logits_v) / (sum w_v)^(1 - a),  with 0 < w_v and 0 < a < 1 learned: a =
-    1 takes glimpses for independent evidence, a = 0 only averages them. The truth lies between, for glimpses of one
-    object err alike.
+    1 takes glimpses for independent evidence, a = 0 only averages them. The truth is in between, as glimpses of one
+    object have similar errors.
 
     Args:
         categories: number of logits.
         width: channels of the first layer.
-        sizes: whether it is told estimates of sizes in metres (`estimate_sizes`).
+        sizes: whether it receives estimates of sizes in metres (`estimate_sizes`).
     """
 
     def __init__(self, categories: int, width: int = 32, sizes: bool = False) -> None:
@@ -88,7 +88,7 @@ class Network(nn.Module):
         nn.init.zeros_(self.weight.bias)
 
     def continue_from(self, start: Network) -> None:
-        """Copy the weights of a network of the same categories and width; sizes it is not told weigh nothing yet."""
+        """Copy the weights of a network of the same categories and width; sizes it does not receive get no weight."""
         state = dict(start.state_dict())
         if self.sizes and not start.sizes:
             state["mix.0.weight"] = nn.functional.pad(state["mix.0.weight"], (0, SIZES))

@@ -37,7 +37,7 @@ class RedNet(Semantics):
     Raises:
         DependencyError: torch is not installed.
         WeightsError: there is no such file ("missing"), or it is no such checkpoint ("unfit").
-        ArgumentError: a face that is no multiple of 32, no range of depths, or no such device.
+        ArgumentError: a face that is not a multiple of 32, no range of depths, or no such device.
     """
 
     needs = ("depth",)
@@ -87,7 +87,7 @@ class RedNet(Semantics):
         """Label perspective views: uint8 [B, H, W, 3] and planar depth float32 [B, H, W] to uint32 [B, H, W].
 
         Raises:
-            ArgumentError: arrays of other shapes, or sides that are no multiples of 32.
+            ArgumentError: arrays of other shapes, or sides that are not multiples of 32.
         """
         sides = images.shape[1:3]
         if images.ndim != 4 or depth.shape != images.shape[:3] or any(side % STRIDE for side in sides):
@@ -120,14 +120,12 @@ def _load_network(path: Path, device: str | None) -> tuple[Any, str]:
         raise DependencyError(f"{error.name or error} not installed; pip install 'wiw[torch]'") from error
     if not path.is_file():
         raise WeightsError(
-            f"no file {path}; the pages of Semantic-MapNet and Habitat-Web link to {FILE} (CC BY-NC 4.0, for "
-            "research). The simulator's semantics need no weights: wiw.perception.semantics.TrueSemantics"
+            f"no file {path}; the pages of Semantic-MapNet and Habitat-Web link to {FILE} (CC BY-NC 4.0, research "
+            "only). The simulator's semantics need no weights: wiw.perception.semantics.TrueSemantics"
         )
     state = _read_state(path)
     if "conv1.weight" not in state:
-        raise WeightsError(
-            f"{path}: no weights of RedNet: there is no 'conv1.weight', but {sorted(state)[:5]}", "unfit"
-        )
+        raise WeightsError(f"{path}: not weights of RedNet: expected 'conv1.weight', got {sorted(state)[:5]}", "unfit")
     network = create_empty(CLASSES, infer_width(state))
     expected = {name: tuple(value.shape) for name, value in network.state_dict().items()}
     differing = sorted(
@@ -137,7 +135,7 @@ def _load_network(path: Path, device: str | None) -> tuple[Any, str]:
     )
     if differing:
         raise WeightsError(
-            f"{path}: no weights of RedNet with {CLASSES} categories: {len(differing)} of {len(expected)} parameters "
+            f"{path}: not weights of RedNet with {CLASSES} categories: {len(differing)} of {len(expected)} parameters "
             f"are missing, unknown or of another shape: {', '.join(differing[:5])}",
             "unfit",
         )
@@ -163,7 +161,7 @@ def _read_state(path: Path) -> dict[str, Any]:
         first = (str(error).strip().splitlines() or [type(error).__name__])[0]
         raise WeightsError(
             f"{path}: not a checkpoint that can be read without running code from it ({first}); save its 'model_state' "
-            "with safetensors.torch.save_file and name that file",
+            "with safetensors.torch.save_file and use that file",
             "unfit",
         ) from error
     state = checkpoint.get("model_state") if isinstance(checkpoint, dict) else None

@@ -73,14 +73,12 @@ class Remote(Detector):
             raise RemoteError(f"{self.address} answered {error.code}: {text}", "raised") from error
         except (OSError, HTTPException) as error:
             if isinstance(error, TimeoutError) or isinstance(getattr(error, "reason", None), TimeoutError):
-                text = (
-                    f"{self.address}: no answer within {self.seconds} s; ask for fewer images or wait longer (seconds=)"
-                )
+                text = f"{self.address}: no answer within {self.seconds} s; send fewer images or wait longer (seconds=)"
                 raise RemoteError(text, "deadline") from error
             text = f"{self.address} cannot be reached ({error}); start the detector's server, see docs/perception.md"
             raise RemoteError(text, "connection") from error
         if len(response) > MAX_BYTES:
-            raise RemoteError(f"{self.address}: an answer of more than {MAX_BYTES} bytes", "message")
+            raise RemoteError(f"{self.address}: the answer is longer than {MAX_BYTES} bytes", "message")
         return response
 
     def _read_body(self, answer: Any) -> bytes:

@@ -22,7 +22,7 @@ WEIGHTS = "facebook/sam2.1-hiera-tiny"
 
 
 class Sam2(FrameTracker):
-    """Segments the target in the imagined frames as a video that begins with a real view.
+    """Segments the target in the imagined frames, treated as a video that begins with a real view.
 
     Args:
         weights: a folder or hub name that `transformers.Sam2VideoModel.from_pretrained` takes, or such a model.

@@ -30,7 +30,7 @@ CATEGORIES = (
 )  # fmt: skip
 """Categories of the built-in labellers, in the apartments' words; index 0 is everything else."""
 MERGED = {"door frame": "opening", "passage": "opening"}
-"""Categories of scenes that labels do not tell apart."""
+"""Categories of scenes that labels do not distinguish."""
 
 
 @dataclass(frozen=True)
@@ -56,7 +56,7 @@ class Labeller(ABC):
     needs: tuple[str, ...] = ()
     """"ids" where views must come with the simulator's instance ids."""
     privileged = False
-    """Whether it knows what no sensor of the agent measures."""
+    """Whether it uses information that no sensor of the agent measures."""
 
     @abstractmethod
     def compute_labels(
@@ -116,7 +116,7 @@ class Labeller(ABC):
             provided = None if ids is None else f"{ids.dtype} {ids.shape}"
             raise ArgumentError(
                 f"label: {type(self).__name__} reads the simulator's instance ids; expected ids uint32 "
-                f"{images.shape[:3]}, got {provided}; imagined views have none, so label these with another labeller"
+                f"{images.shape[:3]}, got {provided}; imagined views have none, so use another labeller for these"
             )
         return ids
 

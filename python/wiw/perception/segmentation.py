@@ -42,7 +42,7 @@ class Segmenter(ABC):
         """
         seen, pointed = check_images("segment", images, ids, "ids" in self.needs)
         if len(boxes) != len(seen):
-            raise ArgumentError(f"segment: expected one array of boxes an image, got {len(boxes)} for {len(seen)}")
+            raise ArgumentError(f"segment: expected one array of boxes per image, got {len(boxes)} for {len(seen)}")
         asked = [_check_boxes(given) for given in boxes]
         if not seen:
             return []
@@ -61,7 +61,7 @@ def _check_boxes(given: ArrayLike) -> NDArray[np.float32]:
         raise ArgumentError(f"segment: expected boxes [N, 4], got {boxes.shape}")
     if not (boxes[:, 2:] > boxes[:, :2]).all():
         raise ArgumentError(
-            f"segment: expected boxes with left < right and top < bottom, got {boxes.tolist()}; turn a panorama "
+            f"segment: expected boxes with left < right and top < bottom, got {boxes.tolist()}; rotate a panorama "
             "(wiw.panorama.rotate) until its seam crosses no box"
         )
     return boxes

@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Trackers, which locate the target in imagined frames: their interface, and the one that needs geometry alone.
+"""Trackers, which locate the target in imagined frames: their interface, and the one that only needs geometry.
 
-`Reprojection` shows where the target would be if a frame showed what its plan asked for: for world models that are told
+`Reprojection` shows where the target would be if a frame showed what its plan asked for: for world models that take
 poses. `wiw.perception.frame_tracking` has those that look at the frames.
 """
 
@@ -30,9 +30,9 @@ class Track:
     """A target in the K frames of one imagined plan."""
 
     masks: NDArray[np.bool_]
-    """bool [K, H, W], in the frames' size; empty where the target is lost."""
+    """bool [K, H, W], in the frames' size; empty if the target is lost."""
     boxes: tuple[Box | None, ...]
-    """K boxes in the frames' pixels, None where the target is lost; across a panorama's seam left > right."""
+    """K boxes in the frames' pixels, None if the target is lost; across a panorama's seam left > right."""
 
     @property
     def visible(self) -> NDArray[np.bool_]:
@@ -125,7 +125,7 @@ def track_rollouts(
 
 
 class Reprojection(Tracker):
-    """Moves the target's mask with the depth mesh of the real panorama; needs no frames and no learning.
+    """Moves the target's mask with the depth mesh of the real panorama, without using frames or learning.
 
     Parts hidden behind other surfaces in the new view are not marked, as the mesh is drawn with a depth test. Parts
     that the real observation did not show are unknown: boxes enclose only what was visible.
@@ -182,7 +182,7 @@ def reproject_masks(
     size: tuple[int, int],
     hfov_deg: float | None = None,
 ) -> tuple[NDArray[np.bool_], NDArray[np.bool_]]:
-    """Return masks of a panorama as seen from other poses, bool [T, K, h, w]; three cost as much as one.
+    """Return masks of a panorama as seen from other poses, bool [T, K, h, w]; three take as long as one.
 
     Also returns what the panorama did not show of the new views, bool [K, h, w].
 
@@ -212,7 +212,7 @@ def get_target(observation: Observation) -> Target:
         ArgumentError: it has none.
     """
     if observation.target is None:
-        raise ArgumentError("expected an observation with a target; only tasks that point something out give one")
+        raise ArgumentError("expected an observation with a target, which only tasks such as ar provide")
     return observation.target
 
 
@@ -243,13 +243,13 @@ def _check_arguments(
 ) -> None:
     if not len(observations) == len(viewpoints) == len(frames):
         raise ArgumentError(
-            f"track: expected one observation, one array of viewpoints and one of frames a plan, got "
+            "track: expected one observation, one array of viewpoints and one of frames per plan, got "
             f"{len(observations)}, {len(viewpoints)} and {len(frames)}"
         )
     for observation, poses, images in zip(observations, viewpoints, frames, strict=True):
         get_target(observation)
         if "depth" in tracker.needs and observation.depth is None:
-            raise ArgumentError(f"{type(tracker).__name__} needs depth: make the environment with depth=True")
+            raise ArgumentError(f"{type(tracker).__name__} needs depth: create the environment with depth=True")
         if images.ndim != 4 or images.shape[3] != 3 or np.shape(poses) != (len(images), 4, 4):
             raise ArgumentError(
                 f"track: expected frames [K, H, W, 3] and viewpoints [K, 4, 4], got {images.shape}, {np.shape(poses)}"

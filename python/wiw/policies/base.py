@@ -18,67 +18,67 @@ from wiw.types import PRIMITIVES, Answer, Decision, Exchange, Goal, Key, Proposa
 
 @dataclass(frozen=True)
 class FrameSpec:
-    """The view and size of imagined frames that a policy asks for: the paper's 384x384 views, or panoramas of any size.
+    """The view and size of imagined frames that a policy requests: the paper's 384x384 views, or panoramas of any size.
 
-    A perspective world model can only give its front view, whatever is asked for.
+    A perspective world model can only give its front view, whatever is requested.
     """
 
     view: str = "front"
     """"front" (HFOV 90), "surround" (front, left, right, back) or "panorama"."""
     size: tuple[int, int] = (384, 384)
     ends: bool = False
-    """Whether only what each plan ends with is shown: rollouts of one frame. Models that compute frames one by one then
-    compute no other."""
+    """Whether only the last frame of each plan is needed. Models that compute frames one by one then compute no
+    other."""
     source_size: tuple[int, int] | None = None
-    """(height, width) of imagined panoramas that are enough for this view and size: a world model that draws in a range
-    of sizes is asked for these. None: its usual size, which is its largest."""
+    """(height, width) of imagined panoramas that suffices for this view and size: it is requested from world models
+    that support a range of sizes. None: their default size, the largest."""
 
 
 @dataclass(frozen=True)
 class Situation:
-    """One live episode at the moment of a decision, as far as a policy may know it."""
+    """One live episode at the moment of a decision, as far as a policy may know."""
 
     observation: Any
     """`Observation`, or `ArmObservation` for a policy that plans in poses."""
     goal: Goal
     key: Key
     memory: Any
-    """Memory of this episode, as `Policy.begin` returned it; the policy may change it."""
+    """Memory of this episode, returned by `Policy.begin`; the policy may change it."""
     executed: tuple[Any, ...] = ()
-    """Primitives, or poses, executed since the episode began."""
+    """Primitives or poses executed since the episode began."""
     imagines: bool = True
-    """Whether a world model will imagine the plans proposed now. Without one, a policy that takes its first plan needs
-    to propose only one.
+    """Whether a world model will imagine the plans proposed now. If not, a policy that always takes its first plan
+    needs to propose only one.
     """
 
 
 class Policy(ABC):
-    """Base, proposal and revision policy in one (paper, appendix "Policies in Embodied Tasks").
+    """Base, proposal and revision policy in one class (paper, appendix "Policies in Embodied Tasks").
 
-    All calls are batched over the live episodes. Randomness must be drawn from `situation.key` alone.
+    All calls are batched over the live episodes. All randomness must be derived from `situation.key`.
     """
 
     space: str = PRIMITIVES
-    """Kind of actions that its plans are made of: a name of `wiw.loop.plan_space`."""
+    """Kind of actions in its plans: a name from `wiw.loop.plan_space`."""
     needs: tuple[str, ...] = ()
-    """"depth" where observations must carry it, "wrist" where they must have the view of an arm's wrist camera."""
+    """"depth" if observations must include it, "wrist" if they must include the view of an arm's wrist camera."""
     frames: FrameSpec = FrameSpec()
     default_revision: str | None = None
-    """Name of the reviser to use where this policy only proposes."""
+    """Name of the default reviser, if this policy only proposes."""
     tokens: int = 0
-    """Tokens that the policy's language model has read and written so far; 0 without one."""
+    """Tokens read and written so far by the policy's language model; 0 without one."""
 
     @property
     def unwrapped(self) -> Policy:
-        """The policy itself, behind everything that wraps it."""
+        """The policy itself, without any wrappers."""
         return self
 
     @classmethod
     def require(cls, task: Mapping[str, Any]) -> None:
-        """Check, before a run begins, that the policy is made for a task that describes itself so. Default: any task.
+        """Check, before a run begins, that the policy suits a task with this description. Default: any task.
 
         Raises:
-            ArgumentError: it is not.
+            ArgumentError: it does not.
         """
         return
 
@@ -87,7 +87,7 @@ class Policy(ABC):
         return None
 
     def observe(self, situations: Sequence[Situation]) -> None:
-        """Update the memory; called once per decision, before `propose`, also on a policy that only revises. Default:
+        """Update the memory; called once per decision before `propose`, even if the policy only revises. Default:
         nothing.
         """
         return
@@ -98,11 +98,12 @@ class Policy(ABC):
         raise NotImplementedError
 
     def extend(self, situations: Sequence[Situation], candidates: int, horizon: int) -> list[list[Proposal]]:
-        """Return continuations of imagined plans, one list per situation; called where the beam search goes deeper.
+        """Return continuations of imagined plans, one list per situation; called for the deeper levels of the beam
+        search.
 
-        Each situation stands at the end of a plan: its images are imagined, its odometry is where the plan leads if no
-        step is refused, it has no depth. `memory` is the real episode's and must not be changed. Default: propose as
-        if the agent were there, with a copy of its memory that has observed the place. A policy that observes depth
+        Each situation is at the end of a plan: its images are imagined, its odometry is where the plan leads if no step
+        is refused, and it has no depth. `memory` belongs to the real episode and must not be changed. Default: propose
+        as if the agent were there, with a copy of its memory that has observed the place. A policy that observes depth
         must override this.
         """
         there = [replace(situation, memory=deepcopy(situation.memory)) for situation in situations]
@@ -124,7 +125,7 @@ class Policy(ABC):
         proposals: Sequence[Sequence[Proposal]],
         rollouts: Sequence[Sequence[Rollout] | None],
     ) -> list[NDArray[np.float64]]:
-        """Score the plans of all episodes; where nothing was imagined, the proposer's own preference counts."""
+        """Score the plans of all episodes; if nothing was imagined, use the proposer's own preference."""
         scores = [np.array([plan.prior for plan in plans], np.float64) for plans in proposals]
         shown = [(place, own) for place, own in enumerate(rollouts) if own is not None]
         if not shown:
@@ -157,25 +158,25 @@ class Policy(ABC):
         proposals: Sequence[Sequence[Proposal]],
         rollouts: Sequence[Sequence[Rollout] | None],
     ) -> Sequence[Answer | TextAnswer | None]:
-        """Return what each episode's agent believes: an `Answer` where its goal has choices, a `TextAnswer` where it is
-        a question; `rollouts` are None without a world model.
+        """Return what each episode's agent believes: an `Answer` if its goal has choices, a `TextAnswer` if it is a
+        question; `rollouts` are None without a world model.
 
-        Called on the revising policy once per decision, with what is seen and what was imagined. Default: no answer.
+        Called on the reviser once per decision, with what is observed and what was imagined. Default: no answer.
         """
         return [None] * len(situations)
 
     def draw(self, situation: Situation, decision: Decision, north: float) -> Mapping[str, NDArray[np.uint8]]:
-        """Return pictures of what the policy believes, uint8 [H, W, 3] by name; default: none.
+        """Return images of what the policy believes, uint8 [H, W, 3] by name. Default: none.
 
-        Called once after each decision of an episode whose record keeps pictures, and in no other. It must not change
-        the memory: a run with pictures decides as one without.
+        Called once after each decision, only in episodes whose record keeps images. It must not change the memory: a
+        run must decide the same with and without images.
 
         Args:
             situation: as at the decision; its memory is up to date.
-            decision: as it was made, without what observers measure, such as its fidelity.
-            north: azimuth, in the frame of the episode's start, of what is up on maps of the scene, so that a map can
-                be drawn as they are. It comes from the environment, so nothing but pictures may depend on it; a policy
-                in a process of its own is told 0, the heading at the start.
+            decision: as made, without what observers measure, such as its fidelity.
+            north: azimuth, in the frame of the episode's start, of the upward direction on maps of the scene, so that
+                maps can be drawn in the same orientation. It comes from the environment, so only images may depend on
+                it; a policy in a separate process gets 0, the heading at the start.
         """
         return {}
 

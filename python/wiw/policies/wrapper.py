@@ -14,7 +14,7 @@ from wiw.types import Answer, Decision, Exchange, Goal, Key, Proposal, Rollout, 
 
 
 class PolicyWrapper(Policy):
-    """Passes every call on to the wrapped policy; a subclass overrides what it changes."""
+    """Passes every call on to the wrapped policy; a subclass overrides the methods that it changes."""
 
     def __init__(self, inner: Policy) -> None:
         self.inner = inner
@@ -59,7 +59,7 @@ class PolicyWrapper(Policy):
         proposals: Sequence[Sequence[Proposal]],
         rollouts: Sequence[Sequence[Rollout] | None],
     ) -> list[NDArray[np.float64]]:
-        """Score or prefer as the wrapped policy does, or by the `score` of a subclass that has one of its own."""
+        """Score or prefer as the wrapped policy does, or by the `score` of a subclass that defines one."""
         if type(self).score is not PolicyWrapper.score:
             return super().score_or_prefer(situations, proposals, rollouts)
         return self.inner.score_or_prefer(situations, proposals, rollouts)

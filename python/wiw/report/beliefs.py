@@ -57,7 +57,7 @@ class Verdict:
 
 
 def list_expected(episode: Episode) -> tuple[str, ...]:
-    """Return the answers that count as right, the main one first; empty where the task expects none."""
+    """Return the answers that count as right, the main one first; empty if the task expects none."""
     question = episode.info.get("question")
     if isinstance(question, Mapping):
         return str(question.get("answer", "")), *(str(extra) for extra in question.get("extra_answers", ()))
@@ -66,7 +66,7 @@ def list_expected(episode: Episode) -> tuple[str, ...]:
 
 
 def list_beliefs(decisions: Sequence[Mapping[str, Any]], expected: Sequence[str]) -> list[Belief | None]:
-    """Return what was believed at each decision; None where the task asks for no answer."""
+    """Return what was believed at each decision; None if the task asks for no answer."""
     accepted = {normalise(text) for text in expected}
     labels = [row["answer"]["label"] if row["answer"] else None for row in decisions]
     found: list[Belief | None] = []
@@ -84,7 +84,7 @@ def list_beliefs(decisions: Sequence[Mapping[str, Any]], expected: Sequence[str]
 
 
 def read_verdict(details: Mapping[str, Any]) -> Verdict | None:
-    """Return the judgement that an outcome's details hold; None where the task has no judge."""
+    """Return the judgement that an outcome's details hold; None if the task has no judge."""
     found = read_end_judgement(details)
     if found is None:
         return None

@@ -32,7 +32,7 @@ def write_scaling(table: ScalingTable, plan: Mapping[str, Any], numbers: str, fo
         table: the numbers.
         plan: what was settled before, as JSON values.
         numbers: the table as JSON.
-        folder: made where it is not there.
+        folder: made where it does not exist.
 
     Raises:
         FileError: it cannot be written.

@@ -34,11 +34,11 @@ TITLES: Mapping[str, str] = {
 """Measures that tables show."""
 ABOUT: Mapping[str, str] = {
     "error": "Root mean squared error in grey levels of held-out frames after 4 actions, from another place.",
-    "regret": "How much further from the goal the chosen plan ends than the best one.",
+    "regret": "How much further from the goal the chosen plan ends than the best plan.",
     "psnr/4": "Of the same frames as the error.",
     "ssim/4": "Of the same frames as the error.",
-    "gap/displacements": "PSNR under the true actions less that under another clip's, turned to the true heading.",
-    "rank": "Kendall's tau of the plans' scores with those that true pictures give.",
+    "gap/displacements": "PSNR under the true actions minus that under another clip's, turned to the true heading.",
+    "rank": "Kendall's tau between the plans' scores and those from true images.",
 }
 
 
@@ -98,17 +98,19 @@ def list_splits(table: ScalingTable) -> list[tuple[str, list[str]]]:
 
 def explain(table: ScalingTable) -> list[str]:
     """Return what the study says, in sentences: the verdicts, fewer scenes, references, and how little it is."""
-    lines = [_tell_split(each) for each in table.splits]
+    lines = [_describe_split(each) for each in table.splits]
     lines += [
-        _tell_scenes(table.find_curve(model, FEWER_SCENES, name)) for model in table.models for name in table.primary
+        _describe_scene_gain(table.find_curve(model, FEWER_SCENES, name))
+        for model in table.models
+        for name in table.primary
     ]
     lines += [
         f"For comparison, {name}: " + ", ".join(f"{measure} {value:.3g}" for measure, value in values.items()) + "."
         for name, values in table.references.items()
     ]
     lines.append(
-        f"Intervals: 95 %, over scenes and {table.seeds} seed{'' if table.seeds == 1 else 's'} drawn anew together; "
-        + ("one seed says nothing about others." if table.seeds == 1 else "so few seeds are a rough guide.")
+        f"Intervals: 95 %, over scenes and {table.seeds} seed{'' if table.seeds == 1 else 's'} resampled together; "
+        + ("one seed says nothing about other seeds." if table.seeds == 1 else "so few seeds are a rough guide.")
     )
     return lines
 
@@ -172,18 +174,18 @@ def _show_split(found: ModelSplit) -> list[str]:
     return [*parts, share, split.verdict]
 
 
-def _tell_split(found: ModelSplit) -> str:
+def _describe_split(found: ModelSplit) -> str:
     split, form = found.split, _choose_form(found.split.total.value)
     who = f"{found.model}, {found.measure}"
     if split.verdict == "no gain":
-        return f"{who}: from the smallest to the largest size there is no gain beyond chance, so nothing to split."
+        return f"{who}: from the smallest to the largest size there is no significant gain, so nothing to split."
     return (
         f"{who}: of the gain of {show_interval(split.total, form)} from the smallest to the largest size, "
-        f"{show_interval(split.share, '.0f')} % comes with the smallest size trained as long: {split.verdict}."
+        f"{show_interval(split.share, '.0f')} % is reached by the smallest size when trained as long: {split.verdict}."
     )
 
 
-def _tell_scenes(curve: Curve) -> str:
+def _describe_scene_gain(curve: Curve) -> str:
     form = _choose_form(curve.gain.value)
     verdict = "" if curve.gain.excludes_zero else ", which may be chance"
     few, whole = curve.arm.amounts[0], curve.arm.amounts[-1]

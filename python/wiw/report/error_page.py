@@ -30,10 +30,10 @@ def write_errors(tables: Sequence[ErrorTable], settings: Mapping[str, Any], numb
     """Write errors.html, .svg, .png and .json into a folder, and return their paths.
 
     Args:
-        tables: one a task.
+        tables: one per task.
         settings: of the study.
         numbers: the tables as JSON.
-        folder: made where it is not there.
+        folder: made where it does not exist.
 
     Raises:
         FileError: it cannot be written.

@@ -12,19 +12,19 @@ from rich.text import Text
 from wiw.analysis.errors import METRES, PSNR, STEP, Cost, CostGap, ErrorLine, ErrorTable
 from wiw.analysis.statistics import LEVEL, Difference, Estimate
 from wiw.analysis.summary import show_estimate, show_p
-from wiw.experiments.errors import ERRORS
+from wiw.experiments.errors.kinds import ERRORS
 from wiw.report.quality_tables import RANK_TITLES, show_rank
 from wiw.report.tables import ROOMY, print_stacked
 
 ABOUT: Mapping[str, str] = {
     "minus oracle": "Paired difference from the same agent with true futures, in points.",
-    "p": "Sign-flip test over scenes of this difference, adjusted by Holm for all arms.",
-    "regret": "Reviser's score of the best true future less that of the chosen plan's; minus the oracle's.",
+    "p": "Sign-flip test of this difference over scenes, Holm-adjusted over all arms.",
+    "regret": "The reviser's score of the best true future minus that of the chosen plan's, minus the oracle's.",
     "actions": "Executed actions per episode, minus the oracle's.",
     "1 - SSIM": "Dissimilarity of imagined and true frames, as the reviser sees them.",
     "LPIPS": "Perceptual distance of imagined and true views of 256x256 pixels.",
-    "PSNR": "Of imagined and true frames, dB; 100 for equal ones.",
-    "metres": "How far the imagined camera, or gripper, was from its place.",
+    "PSNR": "PSNR of imagined and true frames, dB; 100 for equal ones.",
+    "metres": "Distance of the imagined camera, or gripper, from its true place.",
 }
 COST_TITLES = ("points lost", "regret", "arms")
 GAP_TITLES = ("points", "regret")
@@ -80,23 +80,23 @@ def explain(table: ErrorTable) -> list[str]:
     gain = table.gain
     found = []
     if gain is not None:
-        sure = "" if gain.p_value <= LEVEL else ", which may be chance: little can be lost that was not won"
-        found.append(f"True futures bring {show_estimate(gain.estimate, signed=True)} points over none{sure}.")
+        sure = "" if gain.p_value <= LEVEL else ", which may be chance: little can be lost where little was gained"
+        found.append(f"True futures gain {show_estimate(gain.estimate, signed=True)} points over none{sure}.")
     costs = [each for each in table.costs if each.measure == table.distance]
-    found += [_tell_cost(each, table.label) for each in costs]
-    found += [_tell_gap(each) for each in table.gaps if each.measure == table.distance]
-    found += [_tell_cost(each, table.label) for each in table.costs if each.measure == METRES]
+    found += [_describe_cost(each, table.label) for each in costs]
+    found += [_describe_gap(each) for each in table.gaps if each.measure == table.distance]
+    found += [_describe_cost(each, table.label) for each in table.costs if each.measure == METRES]
     if lost := [line for line in table.lines if _is_loss(line)]:
         found.append(
-            "Below the oracle beyond chance, adjusted for all arms: " + ", ".join(line.arm for line in lost) + "."
+            "Significantly below the oracle, adjusted for all arms: " + ", ".join(line.arm for line in lost) + "."
         )
     else:
-        found.append("No single arm is below the oracle beyond chance, adjusted for all arms.")
+        found.append("No single arm is significantly below the oracle, adjusted for all arms.")
     if table.left_out:
-        found.append(f"Left out, for they make no sense in {table.task}: {', '.join(table.left_out)}.")
+        found.append(f"Left out, as they make no sense in {table.task}: {', '.join(table.left_out)}.")
     found.append(
-        f"{table.episodes} episodes in {table.scenes} scenes, policy {table.policy}; costs are over episodes that are "
-        "scored in all of their arms. Intervals: 95 %, over scenes. A cost assumes losses in proportion to distance."
+        f"{table.episodes} episodes in {table.scenes} scenes, policy {table.policy}; costs are over episodes scored in "
+        "all of their arms. Intervals: 95 %, over scenes. A cost assumes that losses are proportional to distance."
     )
     return found
 
@@ -108,8 +108,8 @@ def print_errors(tables: Sequence[ErrorTable]) -> None:
     for table in tables:
         for title, titles, rows, heading in (
             (f"{table.task}: errors of known doses", list_titles(table), list_lines(table), "arm"),
-            ("What a family of errors costs", COST_TITLES, list_costs(table), "family"),
-            ("One family less another", GAP_TITLES, list_gaps(table), "families"),
+            ("Cost of each family of errors", COST_TITLES, list_costs(table), "family"),
+            ("Differences between families", GAP_TITLES, list_gaps(table), "families"),
             (f"Rank correlation with {table.label} over arms", RANK_TITLES, list_correlations(table), "measure"),
         ):
             print_stacked(title, [name for name, _ in rows], titles, [cells for _, cells in rows], heading)
@@ -157,7 +157,7 @@ def _is_loss(line: ErrorLine) -> bool:
     return line.loss.is_shown and line.loss.estimate.value < 0
 
 
-def _tell_cost(found: Cost, label: str) -> str:
+def _describe_cost(found: Cost, label: str) -> str:
     sure = "" if found.loss.excludes_zero else ", which may be chance"
     return (
         f"Errors of {found.family} cost {show_estimate(found.loss)} points of {label} per {_name_step(found.measure)} "
@@ -165,12 +165,12 @@ def _tell_cost(found: Cost, label: str) -> str:
     )
 
 
-def _tell_gap(found: CostGap) -> str:
+def _describe_gap(found: CostGap) -> str:
     if not found.loss.excludes_zero:
         verdict = "undecided"
     else:
         verdict = f"{found.family if found.loss.value > 0 else found.base} costs more"
     return (
-        f"At an equal distance, {found.family} less {found.base}: {show_estimate(found.loss, signed=True)} points per "
+        f"At equal distance, {found.family} minus {found.base}: {show_estimate(found.loss, signed=True)} points per "
         f"{_name_step(found.measure)}: {verdict}."
     )

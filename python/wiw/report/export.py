@@ -35,7 +35,7 @@ def export(run: Run, csv: Path | None = None, parquet: Path | None = None, rerun
         rerun: recording for the Rerun viewer.
 
     Raises:
-        ArgumentError: nothing is asked for, or a package that it needs is not installed.
+        ArgumentError: nothing is requested, or a package that it needs is not installed.
         FileError: a folder holds something already, or cannot be written.
     """
     if csv is None and parquet is None and rerun is None:

@@ -74,7 +74,7 @@ def _render_within(run: Run, episodes: int | None, max_mb: float, remark: str) -
     if not fits(bare):
         size = len(bare.encode()) / 10**6
         raise ArgumentError(
-            f"report: its tables and plots alone take {size:.2f} MB; expected max_mb of more, got {max_mb}"
+            f"report: the tables and plots alone take {size:.2f} MB; expected a larger max_mb, got {max_mb}"
         )
     return bare
 
@@ -161,7 +161,7 @@ def sentence(summary: Summary, words: Wording | None = None) -> str:
 
 
 def explain_metrics(summary: Summary, words: Wording) -> list[tuple[str, str]]:
-    """Return what each column of the table of arms means in this task, and who gave the marks where there are any."""
+    """Return what each column of the table of arms means in this task, and who gave the marks if there are any."""
     own = {
         "success": f"Success rate: percent of episodes that {words.succeeded}.",
         "spl": f"Success weighted by path length. {SPL_RULE}",
@@ -170,17 +170,19 @@ def explain_metrics(summary: Summary, words: Wording) -> list[tuple[str, str]]:
     }
     if summary.marks is not None:
         own["spl"] = (
-            "Score weighted by path length: it counts as shortest walk to where the answer can be seen, over metres "
-            "walked."
+            "Score weighted by path length: the score times the shortest walk to where the answer can be seen, over "
+            "metres walked."
         )
     found = []
     for metric in list_columns(summary):
         name = f"{metric.label} ({metric.paper_name} in the paper)" if metric.paper_name else metric.label
         found.append((name, own.get(metric.name, metric.about)))
     if summary.marks is not None:
-        found.append(("Judge", f"{summary.marks.judge.full_label}: gave each answer a mark, 1 (wrong) to 5 (right)."))
+        found.append(
+            ("Judge", f"{summary.marks.judge.full_label}: gave each answer a mark from 1 (wrong) to 5 (right).")
+        )
     if summary.baselines:
-        found.append((BLIND, "The most frequent answer of train scenes to such a question, without looking."))
+        found.append((BLIND, "The most frequent answer to such a question in train scenes, given without looking."))
     return found
 
 
@@ -254,9 +256,9 @@ def _draw_plots(
     found.append(("Success by arm", about, plots.success_by_arm(summary)))
     ways = {arm: [row for row in rows if row["geodesic"] is not None] for arm, rows in done.items()}
     if any(ways.values()):
-        about = "Do longer paths need the world model more?"
+        about = "Do longer paths benefit more from the world model?"
         if plots.shows_single_outcomes(ways):
-            about += f" A circle per episode; filled: {words.won}, hollow: {words.lost}."
+            about += f" One circle per episode; filled: {words.won}, hollow: {words.lost}."
         found.append(("Success by distance", about, plots.success_by_distance(ways, words)))
     if sum(not math.isnan(line.rank) for line in truths) > 1:
         about = "Does an arm that ranks plans correctly also succeed? Kendall's tau against the true futures."
@@ -268,16 +270,16 @@ def _draw_plots(
 
 
 def _plot_anytime_curves(summary: Summary) -> list[tuple[str, str, Markup]]:
-    """Return title, explanation and drawing of the anytime curve and of each paired difference, where there are any."""
+    """Return title, explanation and drawing of the anytime curve and of each paired difference, if there are any."""
     found = []
     for curve in summary.breakdowns:
         if curve.name == "anytime":
-            about = "Score if every episode had been cut there; bands are 95 % intervals."
+            about = "Score if every episode had been cut off there; bands are 95 % intervals."
             if BLIND in curve.estimates:
-                about += " Dashed: the best guess from the question's text, which counts where nothing is answered."
+                about += " Dashed: the best guess from the question's text, which counts if nothing is answered."
             title = "Success by decisions" if curve.cut_unit == DECISIONS else "Score by budget"
             found.append((title, about, plots.anytime_curve(curve)))
         elif curve.name == "anytime_differences":
-            about = "Paired by episode, if every episode had been cut there; bands are 95 % intervals."
+            about = "Paired by episode, if every episode had been cut off there; bands are 95 % intervals."
             found.append((f"Gain over {curve.base} by budget", about, plots.anytime_differences(curve)))
     return found

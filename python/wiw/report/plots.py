@@ -47,7 +47,7 @@ BLAME_COLORS = {
     "answering": "#8b9099",
 }
 TICKS = 5
-"""Most intervals between the numbers of an axis: more collide where names of arms or fonts are wide."""
+"""Maximum number of intervals between the numbers of an axis: more collide where names of arms or fonts are wide."""
 WIDEST_LABEL = 36
 """Characters on a line of a long label beside an axis."""
 FEW = 24
@@ -314,7 +314,7 @@ def _prepare_error_axes(axes: Axes, table: ErrorTable, regret: bool) -> float:
 
 
 def _find_error_point(line: ErrorLine, regret: bool) -> Any:
-    """Return the success of an arm, or its regret beyond the oracle's; None where it was not measured."""
+    """Return the success of an arm, or its regret beyond the oracle's; None if it was not measured."""
     if not regret:
         return line.outcome
     return None if line.regret is None else line.regret.estimate

@@ -23,7 +23,7 @@ def write_quality(table: QualityTable, pictures: Mapping[str, Sequence[Any]], nu
         table: the numbers.
         pictures: some of the frames by arm, uint8 [H, W, 3], the same of each.
         numbers: the table as JSON.
-        folder: made where it is not there.
+        folder: made where it does not exist.
 
     Raises:
         FileError: it cannot be written.

@@ -17,7 +17,7 @@ from wiw.report.tables import ROOMY, Column, print_stacked, stack_tables
 
 ABOUT = {
     "SSIM": "Controllability: structural similarity of imagined and true frames, 1 for equal ones.",
-    "1 - LPIPS": "Controllability as in the paper: 1 less the perceptual distance of imagined and true frames.",
+    "1 - LPIPS": "Controllability as in the paper: 1 minus the perceptual distance of imagined and true frames.",
     PAPER_QUALITY: "Quality as in the paper: (10 aesthetic + MUSIQ) / 2, from 5 to 100.",
     "sharpness": "Variance of the Laplacian of the luma, in squared grey levels. Noise counts as sharp.",
     "colourfulness": "Hasler and Suesstrunk 2003: 0 grey, 15 slightly, 45 fairly, 109 extremely colourful.",

@@ -129,7 +129,7 @@ def write_view(run: Run, folder: Path) -> Site:
     """Write `index.html`, `episodes/` and `images/` into a new folder. All text from the run is escaped.
 
     Raises:
-        FileError: the folder holds something that is no view, or cannot be written.
+        FileError: the folder holds something that is not a view, or cannot be written.
     """
     with atomic_folder(folder, replace=is_view) as draft, ThreadPoolExecutor(core.num_threads()) as pool:
         album = PictureFolder(draft / "images", pool)

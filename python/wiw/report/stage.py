@@ -21,7 +21,7 @@ AROUND = "→↘↓↙←↖↑↗"
 """Ways along the table as the camera sees them, which looks at the arm: +y to the right, +x towards it."""
 UP, DOWN, GRIPS, LETS_GO, STAYS = "↥", "↧", "●", "○", "·"
 STILL = 0.005
-"""Metres that are no way."""
+"""Metres that do not count as motion."""
 SINGLE = 8
 """Poses of which each has a sign of its own and a mark; of longer plans only what changes."""
 SIDE = 100

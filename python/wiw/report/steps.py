@@ -78,7 +78,7 @@ def _format_truth(found: Mapping[str, Any] | None, index: int) -> tuple[str, boo
 
 
 def _join_numbers(values: Mapping[str, Any], said: Mapping[str, tuple[str, str]]) -> str:
-    """Return the numbers that are there, with their names."""
+    """Return the numbers that exist, with their names."""
     return " · ".join(
         f"{title} {form.format(values[name])}" for title, (name, form) in said.items() if values.get(name) is not None
     )

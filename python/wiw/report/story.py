@@ -28,7 +28,7 @@ class Picture:
     source: str
     """Address or data URI."""
     id: str = ""
-    """Id among the pictures that the page defines once; empty where `source` is the address of a file."""
+    """Id among the pictures that the page defines once; empty if `source` is the address of a file."""
     width: int = 0
     height: int = 0
     """Pixels; 0 where the browser reads them from the file."""
@@ -93,7 +93,7 @@ class Candidate:
     true: Picture | None
     """True future."""
     truth: str
-    """Score of what would really have been seen, and how near to it imagination came; empty where not measured."""
+    """Score of what would really have been seen, and how near to it imagination came; empty if not measured."""
     truly_best: bool
     real_frames: int
     """How many leading frames are the real view turned."""
@@ -118,11 +118,11 @@ class Step:
     """The plan, where it is none of the candidates."""
     before: float | None
     after: float | None
-    """Metres of shortest way to the goal or target; straight-line where there is no way; None where the task has none.
+    """Metres of shortest way to the goal or target; straight-line if there is no way; None if the task has none.
     """
     note: str
     fidelity: str
-    """How well imagination ranked the plans; empty where not measured."""
+    """How well imagination ranked the plans; empty if not measured."""
     seconds: Mapping[str, float]
     calls: Mapping[str, float]
     answer: str = ""
@@ -130,7 +130,7 @@ class Step:
     refused: str = ""
     """Why ways of a gripper ended early."""
     shot: str = ""
-    """Id of what a gripper's camera saw among the story's shots; empty where plans are not of poses."""
+    """Id of what a gripper's camera saw among the story's shots; empty if plans are not of poses."""
     belief: Belief | None = None
     """The same for a timeline."""
     believed: tuple[tuple[str, Picture], ...] = ()
@@ -156,7 +156,7 @@ class Attempt:
     film: str | None = None
     """Film of the episode; as `Album.put` returns it."""
     end: str = ""
-    """Id of what was seen at the end among the story's shots; empty where it was not kept."""
+    """Id of what was seen at the end among the story's shots; empty if it was not kept."""
     verdict: Verdict | None = None
     """Judgement of the answer in words, where the task asks for one."""
 
@@ -194,7 +194,7 @@ class Story:
     picture: str | None
     """Id of the scene's map among the page's shared pictures."""
     frame: MapFrame | None
-    """None where plans are of poses: the way is drawn on what the camera sees."""
+    """None if plans are of poses: the way is drawn on what the camera sees."""
     ends: tuple[Mark, Mark] | None
     """Start and goal on the map."""
     attempts: tuple[Attempt, ...]
@@ -221,7 +221,7 @@ class Story:
 
     @property
     def way(self) -> str:
-        """E.g. " · 4.2 m to the goal"; empty where no arm could measure it."""
+        """E.g. " · 4.2 m to the goal"; empty if no arm could measure it."""
         length = self.episode.geodesic
         return f" · {length:.1f} m {self.words.way}" if np.isfinite(length) else ""
 
@@ -232,7 +232,7 @@ class Story:
 
 
 def final_answer(metrics: Mapping[str, Any], choices: Sequence[str]) -> str:
-    """Return the final answer, where the task asks for one; empty where none was given."""
+    """Return the final answer, where the task asks for one; empty if none was given."""
     predicted = int(metrics.get("predicted", -1))
     return choices[predicted] if 0 <= predicted < len(choices) else ""
 

@@ -42,7 +42,7 @@ def write_study(plan: Any, parts: Sequence[Any], numbers: str, folder: Path) -> 
         plan: the study (`wiw.studies.study_file.StudyPlan`).
         parts: what came of its runs.
         numbers: the same as JSON.
-        folder: that is there.
+        folder: that exists.
 
     Raises:
         FileError: it cannot be written.
@@ -80,7 +80,7 @@ def list_figures(part: Part) -> Figures:
         if name == "success":
             found.append(("Success by arm", "Bars are 95 % intervals.", plots.success_by_arm(part.numbers)))
         elif name == "rollouts":
-            about = "A point per arm: success against the futures imagined per episode."
+            about = "One point per arm: success against futures imagined per episode."
             found.append(("Success by imagined futures", about, _plot_rollouts(part)))
         elif part.quality is not None:
             found += _plot_quality(part.quality)
@@ -92,7 +92,7 @@ def _plot_quality(table: QualityTable) -> Figures:
     return [
         (
             f"{table.outcome} and {label}",
-            "A point per arm. Spearman {Spearman} {95 %}, p = {p}, {arms} arms.".format_map(ranks[measure]),
+            "One point per arm. Spearman {Spearman} {95 %}, p = {p}, {arms} arms.".format_map(ranks[measure]),
             plots.success_by_measure(table, measure, label),
         )
         for measure, label in list_drawn_measures(table).items()
@@ -107,15 +107,15 @@ def _plot_rollouts(part: Part) -> Markup:
 
 
 def group_pairs(differences: Sequence[Difference]) -> Group | None:
-    """Return the compared pairs as one table; None where nothing is compared."""
+    """Return the compared pairs as one table; None if nothing is compared."""
     rows: dict[str, dict[str, Difference]] = {}
     for each in differences:
         rows.setdefault(f"{each.arm} - {each.base}", {})[each.metric] = each
-    return Group("Compared, paired by episode", "What is compared", "Arm minus arm", rows) if rows else None
+    return Group("Comparisons, paired by episode", "Arms", "Arm minus arm", rows) if rows else None
 
 
 def _list_quality(table: QualityTable | None) -> dict[str, Any] | None:
-    """Return the table of quality and controllability, with notes; None where it was not measured."""
+    """Return the table of quality and controllability, with notes; None if it was not measured."""
     if table is None:
         return None
     titles, rows = arm_rows(table)

@@ -19,7 +19,7 @@ class ArmText:
     """The parts of an arm's text."""
 
     name: str | None
-    """None where the arm is named by its policy and model."""
+    """None if the arm is named by its policy and model."""
     model: str
     """With what stands before it: a policy and "+", or the kind of a placebo."""
     options: tuple[str, ...] = ()
@@ -56,11 +56,11 @@ def check_arm_name(name: str, text: str | None = None) -> None:
     """
     place = f" in '{text}'" if text is not None else ""
     if not name or name != name.strip():
-        raise ArgumentError(f"arms: expected a name without spaces around it, got '{name}'{place}; as in {EXAMPLE}")
+        raise ArgumentError(f"arms: expected a name without surrounding spaces, got '{name}'{place}; as in {EXAMPLE}")
     if found := FORBIDDEN.search(name):
         raise ArgumentError(
-            f"arms: the name '{name}'{place} has the character {found.group()!r}; use letters, digits, '-', '_' and "
-            f"'.', as in {EXAMPLE}"
+            f"arms: the name '{name}'{place} contains {found.group()!r}; use letters, digits, '-', '_' and '.', as in "
+            f"{EXAMPLE}"
         )
 
 
@@ -73,11 +73,11 @@ def split_arms(text: str) -> list[str]:
     """
     arms = [arm.strip() for arm in re.split(r",(?!\s*wss?://)(?![^\[]*\])", text) if arm.strip()]
     if not arms:
-        raise ArgumentError(f"arms: expected one or several, as in none,copy,warp or {EXAMPLE}, got '{text}'")
+        raise ArgumentError(f"arms: expected at least one, as in none,copy,warp or {EXAMPLE}, got '{text}'")
     return arms
 
 
 def _is_place(model: str) -> bool:
-    """Return whether "=" belongs to an address, or to the path of a file that is there."""
+    """Return whether "=" belongs to an address, or to the path of a file that exists."""
     path, _, _ = model.rpartition(":")
     return "://" in model.partition("=")[0] or (path.endswith(".py") and Path(path).expanduser().is_file())

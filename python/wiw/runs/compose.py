@@ -8,8 +8,8 @@ from dataclasses import dataclass, replace
 from typing import Any
 
 from wiw.errors import ArgumentError
-from wiw.experiments.errors import make_error
 from wiw.experiments.errors.erroneous import Erroneous
+from wiw.experiments.errors.kinds import make_error
 from wiw.experiments.fidelity import FidelityObserver
 from wiw.experiments.gating import Gated
 from wiw.experiments.ground_truth import TruePlans, TrueScores, sort_stages
@@ -20,10 +20,11 @@ from wiw.loop.agent_spec import AgentSpec, space_option
 from wiw.loop.attempts import Attempted, make_model
 from wiw.loop.imagination import Imaginer, ModelInput
 from wiw.loop.keys import make_key
-from wiw.loop.limits import DEADLINE, Limits
+from wiw.loop.limits import DEADLINE
 from wiw.loop.model_imaginer import ModelImaginer
 from wiw.loop.rollout_cache import cache_rollouts
 from wiw.registry import WORLD_MODELS
+from wiw.runs.limits import Limits
 from wiw.types import PRIMITIVES, Episode, Key
 from wiw.world_models.base import WorldModel
 from wiw.world_models.oracle import Oracle
@@ -106,7 +107,7 @@ def _wrap_model(
     if model is None:
         for name in ("placebo", "error"):
             if (given := getattr(experiment, name)) is not None:
-                raise ArgumentError(f"{name}='{given}' needs a world model, and this agent has none")
+                raise ArgumentError(f"{name}='{given}' needs a world model, but this agent has none")
         return None
     imaginer = _make_imaginer(model, experiment.error, limits)
     if experiment.semantics is not None:
@@ -146,7 +147,7 @@ def require_placebo(placebo: str, space: str, episodes: int) -> None:
         raise ArgumentError(NO_POSES)
     if placebo == "swapped" and episodes < 2:
         raise ArgumentError(
-            f"placebo-swapped shows the model another episode: expected at least 2 episodes, got {episodes}"
+            f"placebo-swapped shows the model another episode, so it needs at least 2 episodes; got {episodes}"
         )
 
 

@@ -11,69 +11,72 @@ from typing import Annotated, Any, Literal
 from tyro.conf import arg
 
 from wiw.errors import ArgumentError
-from wiw.loop.limits import Limits
 from wiw.ray_cluster import Engine
+from wiw.runs.limits import Limits
 from wiw.runs.shards import Shard
 from wiw.types import check_seed
 
 
 @dataclass(frozen=True, kw_only=True)
 class EngineConfig(Engine):
-    """The engine that runs the episodes, its place, and the servers of its own."""
+    """The engine that runs the episodes, where it runs, and its servers."""
 
     servers: Annotated[int, arg(metavar="N")] = 0
-    """Servers of --world-model that all workers ask: actors of Ray, or jobs of `wiw submit`; none, and each worker has
-    its own model, if not given."""
+    """Number of servers of --world-model that all workers share: Ray actors, or jobs of `wiw submit`. With 0 each
+    worker has its own model."""
     server_gpus: Annotated[float, arg(metavar="N")] = 1
-    """GPUs of such a server."""
+    """GPUs per server."""
     served: Annotated[str | None, arg(metavar="MODEL")] = None
-    """World model of --arms that actors of Ray serve; --world-model if not given."""
+    """World model of --arms that Ray actors serve. Default: --world-model."""
     vlm_servers: Annotated[int, arg(metavar="N")] = 0
-    """Servers of --vlm transformers:PATH (or mock), as actors of Ray; worker by worker they are taken in turn."""
+    """Number of servers of --vlm transformers:PATH (or mock), as Ray actors; workers are assigned to them in turn."""
     vlm_server_gpus: Annotated[float, arg(metavar="N")] = 1
-    """GPUs of such a server."""
+    """GPUs per server."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class RunConfig(Limits, EngineConfig):
-    """How a run goes, whatever agents it compares. All randomness is keyed by (seed, episode, decision, candidate):
-    neither `workers` nor `live` changes a result.
+    """Settings of a run, independent of the agents it compares. All randomness is keyed by (seed, episode, decision,
+    candidate): neither `workers` nor `live` changes a result.
 
     Raises:
         ArgumentError: a number out of range.
     """
 
     episodes: Annotated[int | None, arg(metavar="N")] = None
-    """Number of episodes; the task's own if not given: all of an episode file, else 20; for manipulation 50 of each of
-    its tasks."""
+    """Number of episodes. Default: the task's, which is all of an episode file, or else 20; for manipulation 50 of each
+    of its tasks."""
     seed: Annotated[int | None, arg(metavar="N")] = None
-    """Seed of all randomness; the task's own, 0, if not given."""
+    """Seed of all randomness. Default: the task's, 0."""
     salt: Annotated[str | None, arg(metavar="TEXT")] = None
-    """Secret under which policies and models get keys and seeds, so that these do not tell which episode it is. Drawn
-    and kept in the store if not given; give the same one to all shards, and to runs whose random draws are to be equal.
-    Empty: keys are seed and index."""
+    """Secret from which the keys and seeds given to policies and models are derived, so that they do not reveal which
+    episode it is. Default: random, and kept in the store. Give the same one to all shards, and to runs that are to
+    share their random draws. Empty: keys are seed and index."""
     out: Annotated[Path | str | None, arg(metavar="DIR")] = None
-    """Folder of the run; runs/TASK-TIME if not given."""
+    """Folder of the run. Default: runs/TASK-TIME."""
     workers: Annotated[int, arg(metavar="N")] = 1
-    """Processes; results do not depend on it. More than one needs names, or a task and agent that can be pickled."""
+    """Number of processes; results do not depend on it. More than one requires a task and agent that are given by name
+    or can be pickled."""
     live: Annotated[int, arg(metavar="N")] = 4
-    """Episodes kept live at a time in a process, so that model calls are batched."""
+    """Episodes that run at the same time in each process, so that model calls are batched."""
     keep_images: Annotated[int | Literal["all"], arg(metavar="N|all")] = 2
-    """Episodes that keep pictures for report and view, of manipulation one of each task at least; all: every one, at
-    0.2 MB per decision."""
+    """Number of episodes that keep images for report and view, in manipulation at least one per task; all: every
+    episode, at 0.2 MB per decision."""
     until: Annotated[str | None, arg(metavar="RULE")] = None
-    """Stop early, once "A-B excludes 0" (a difference of SR between two arms is shown) or "width<8" (every arm's SR is
-    known to so many points; or width(A), width(A-B)), by intervals that allow for looking; --episodes is the most."""
+    """Stop early, once "A-B excludes 0" (a difference in SR between two arms is shown) or "width<8" (every arm's SR is
+    known to within so many points; or width(A), width(A-B)), using intervals that stay valid under repeated looks;
+    --episodes is the maximum."""
     look_every: Annotated[int, arg(metavar="N")] = 20
     """Episodes per arm between two looks of --until."""
     shard: Annotated[str | None, arg(metavar="I/N")] = None
-    """Part I of N of the episodes, in a store of its own; `wiw merge` makes one run of the stores of all parts."""
+    """Run part I of N of the episodes, in a separate store; `wiw merge` combines the stores of all parts into one
+    run."""
     scratch: Annotated[Path | str | None, arg(metavar="DIR")] = None
-    """Folder on a local disk, such as /tmp, where the store is written while the run goes on; it is copied to --out
-    every minute and at the end. Needed where --out is on a network file system. auto: the system's own for temporary
-    files, or the job's."""
+    """Folder on a local disk, such as /tmp, where the store is written during the run; it is copied to --out every
+    minute and at the end. Needed if --out is on a network file system. auto: the temporary folder of the system or the
+    job."""
     resume: bool = False
-    """Whether to resume the run in `out`, if one is there."""
+    """Whether to resume the run in `out`, if there is one."""
     progress: bool = True
     """Whether to show progress bars."""
 
@@ -93,58 +96,60 @@ class RunConfig(Limits, EngineConfig):
         if self.shard is not None:
             Shard.parse(self.shard)
         if self.until is not None and self.episodes is None:
-            raise ArgumentError(
-                "evaluate: until needs the most episodes that the run may have: give --episodes (episodes=)"
-            )
+            raise ArgumentError("evaluate: until requires a maximum number of episodes: give --episodes (episodes=)")
         if self.until is not None and self.shard is not None:
-            raise ArgumentError("evaluate: a shard sees too little of a run to stop it: until cannot be had with shard")
+            raise ArgumentError(
+                "evaluate: a shard sees only part of a run and cannot stop it: give until or shard, not both"
+            )
 
     def _require_use(self) -> None:
-        """Check that no setting is given that the others leave without use."""
+        """Check that every given setting has an effect."""
         if self.engine != "ray" and self.vlm_servers:
-            raise ArgumentError("evaluate: vlm_servers are for engine ray: give --engine ray (engine=)")
+            raise ArgumentError("evaluate: vlm_servers require engine ray: give --engine ray (engine=)")
         if self.served is not None and not self.servers:
-            raise ArgumentError("evaluate: served is the model that servers have: say how many by --servers (servers=)")
+            raise ArgumentError(
+                "evaluate: served is the model that servers run: give their number with --servers (servers=)"
+            )
         if self.cache == "off" and self.cache_gb != RunConfig.cache_gb:
-            raise ArgumentError("evaluate: cache_gb bounds the cache of rollouts, which is off: leave one of them out")
+            raise ArgumentError("evaluate: cache_gb limits the rollout cache, but cache is off: leave one of them out")
         if self.fidelity_share != RunConfig.fidelity_share and not self.measures_fidelity:
-            raise ArgumentError("evaluate: fidelity_share needs something to measure: give --fidelity (fidelity=True)")
+            raise ArgumentError("evaluate: fidelity_share requires fidelity: give --fidelity (fidelity=True)")
         if self.look_every != RunConfig.look_every and self.until is None:
-            raise ArgumentError("evaluate: look_every is between looks of a rule: give --until (until=)")
+            raise ArgumentError("evaluate: look_every requires a stopping rule: give --until (until=)")
 
     @property
     def looks(self) -> dict[str, Any] | None:
-        """Rule and number of episodes between looks, as the run store keeps them; None where nobody looks."""
+        """Rule and number of episodes between looks, as stored in the run; None without a rule."""
         return None if self.until is None else {"rule": self.until, "every": self.look_every}
 
     @property
     def place(self) -> EngineConfig:
-        """The engine that runs the episodes, and its place."""
+        """The engine that runs the episodes, and where it runs."""
         return EngineConfig(**{field.name: getattr(self, field.name) for field in fields(EngineConfig)})
 
     def count_pictured(self, episodes: int) -> int:
-        """Return how many of a run's episodes keep pictures."""
+        """Return how many of a run's episodes keep images."""
         return episodes if isinstance(self.keep_images, str) else self.keep_images
 
 
 @dataclass(frozen=True, kw_only=True)
 class ResumeConfig:
-    """Settings of `RunConfig` that a run may be resumed with in place of its own, from then on; None keeps its own.
+    """Settings of `RunConfig` that may be changed when a run is resumed; None keeps the run's own.
 
-    No score depends on them. What scores or measurements depend on stays as the run was begun.
+    No score depends on them. Everything that scores or measurements depend on stays as when the run was started.
 
     Raises:
         ArgumentError: a number out of range.
     """
 
     live: Annotated[int | None, arg(metavar="N")] = None
-    """Episodes kept live at a time in a process, as in `wiw run`; the run's own number if not given."""
+    """Episodes that run at the same time in each process, as in `wiw run`. Default: as before."""
     deadline: Annotated[float | None, arg(metavar="SECONDS")] = None
-    """Most seconds for a call of the world model; the run's own if not given."""
+    """Time limit in seconds for a call to the world model. Default: as before."""
     cache: Annotated[str | Path | None, arg(metavar="auto|off|DIR")] = None
-    """Where rollouts are cached, as in `wiw run`; where the run caches them if not given."""
+    """Where rollouts are cached, as in `wiw run`. Default: as before."""
     cache_gb: Annotated[float | None, arg(metavar="N")] = None
-    """Most gigabytes of that folder; the run's own if not given."""
+    """Maximum size of that folder in gigabytes. Default: as before."""
 
     def __post_init__(self) -> None:
         self.to_json()  # RunConfig checks the numbers
@@ -161,13 +166,13 @@ def read_resume_settings(settings: Mapping[str, Any]) -> ResumeConfig:
     """Return settings by name as a `ResumeConfig`.
 
     Raises:
-        ArgumentError: one that is fixed once a run is begun.
+        ArgumentError: one that is fixed once a run has started.
     """
     names = [field.name for field in fields(ResumeConfig)]
     if fixed := [name for name in settings if name not in names]:
         raise ArgumentError(
-            f"resume: '{fixed[0]}' stays as the run was begun; expected settings among workers, {', '.join(names)}, on "
-            "which no score depends. For another value start a new run"
+            f"resume: '{fixed[0]}' is fixed once a run has started; expected settings among workers, "
+            f"{', '.join(names)}, on which no score depends. For another value start a new run"
         )
     return ResumeConfig(**settings)
 

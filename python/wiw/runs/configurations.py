@@ -17,16 +17,17 @@ def drop_new_arms(stored: dict[str, Any], wanted: dict[str, Any]) -> dict[str, A
 
 
 def require_same(path: Path, stored: dict[str, Any], wanted: dict[str, Any]) -> None:
-    """Check that a run at `path` was begun with the wanted configuration.
+    """Check that a run at `path` was started with the wanted configuration.
 
     Raises:
-        StoreError: it was begun with another; says in what they differ.
+        StoreError: it was started with another; says in what they differ.
     """
     if stored == wanted:
         return
     detail = "; ".join(_list_differences(stored, wanted))
     raise StoreError(
-        f"{path} is a run of another configuration ({detail}); resume it as it was begun or give another folder"
+        f"{path} holds a run with a different configuration ({detail}); resume it with its own configuration, or give "
+        "another folder"
     )
 
 

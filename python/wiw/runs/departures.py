@@ -11,8 +11,8 @@ from typing import Any
 
 from wiw.loop.config import AgentConfig
 from wiw.mapping_files import read_yaml_mapping
-from wiw.policies.vlm.prompt_import import CARD
-from wiw.policies.vlm.prompts import DEFAULT, SETS, Prompts
+from wiw.policies.vlm.prompt_import.importer import CARD
+from wiw.policies.vlm.prompts.templates import DEFAULT, SETS, Prompts
 from wiw.registry import POLICIES
 from wiw.runs.recipes import ELSEWHERE, REFERENCES, AgentRecipe, find_control
 from wiw.runs.rows import to_json
@@ -39,7 +39,7 @@ REVISER = "vlm"
 SILENT = ("temperature", "revision_temperature", "tries")
 """Options of it that the paper does not name."""
 UNCOUNTED = (*ELSEWHERE, "model", "prompts", "task", "space")
-"""Options of policy `vlm` that are no part of the protocol, or are looked at by themselves."""
+"""Options of policy `vlm` that are not part of the protocol, or are looked at by themselves."""
 
 
 @dataclass(frozen=True)
@@ -48,7 +48,7 @@ class Departure:
 
     topic: str
     found: str = ""
-    """The run's value beside the paper's; empty for what is no setting."""
+    """The run's value beside the paper's; empty for what is not a setting."""
     reason: str = ""
 
     @property

@@ -22,7 +22,7 @@ from wiw.types import Episode, EpisodeResult
 
 
 class Look(Protocol):
-    """Findings of a look at a run that goes on; its string form is a sentence."""
+    """Findings of a look at a run that continues; its string form is a sentence."""
 
     @property
     def is_enough(self) -> bool:
@@ -47,14 +47,14 @@ def read_recipes(store: RunStore) -> tuple[TaskRecipe, dict[str, AgentRecipe]]:
     """Return the recipes of a run's task and agents.
 
     Raises:
-        StoreError: the run was begun with objects that existed only in memory.
+        StoreError: the run was started with objects that existed only in memory.
     """
     info = store.info
     if info["task"] is None or None in info["agents"].values():
         raise StoreError(
-            f"{store.path} was begun with objects in memory, which cannot be made again from here; "
-            "call the same wiw.evaluate(..., out=..., resume=True) again, or begin runs with names: "
-            "wiw.runs.recipes.AgentRecipe, or `wiw run`"
+            f"{store.path} was started with objects in memory, which cannot be rebuilt here; call the same "
+            "wiw.evaluate(..., out=..., resume=True) again. Runs started by name (wiw.runs.recipes.AgentRecipe, or "
+            "`wiw run`) can be resumed from anywhere"
         )
     return TaskRecipe(**info["task"]), {arm: AgentRecipe.from_json(recipe) for arm, recipe in info["agents"].items()}
 
@@ -77,7 +77,7 @@ def require_own_sources(store: RunStore, task: Any, agents: Mapping[str, Any]) -
 
 
 def update_own_sources(store: RunStore, task: Any, agents: Mapping[str, Any]) -> None:
-    """Store the user's own source files as they are now, before a run goes on; close the store where it must not.
+    """Store the user's own source files as they are now, before a run continues; close the store where it must not.
 
     Files that no ended episode was run with may have changed: a model that could not be made is mended, and the run
     resumes.
@@ -117,7 +117,7 @@ def require_scenes(task: Any, store: RunStore, episodes: Iterable[Episode]) -> N
     """Check that the scenes of these episodes are the ones that the run began with.
 
     Raises:
-        FileError: a scene is not there.
+        FileError: a scene does not exist.
         StoreError: what belongs to a scene has come or gone.
     """
     kept = store.info.get("scenes", {})
@@ -298,6 +298,6 @@ class _StoreWriter:
         if len(errors) == SAME_ERRORS and len({error.partition(":")[0] for error in errors}) == 1:
             raise InfrastructureError(
                 f"the first {SAME_ERRORS} episodes of arm '{arm}' all ended with the same error, so the run was "
-                f"stopped: {errors[0]}. Fix the cause, then `wiw resume --retry-errors`; the run "
-                "store has the tracebacks"
+                f"stopped: {errors[0]}. Fix the cause, then `wiw resume --retry-errors`; the tracebacks are in the run "
+                "store"
             )

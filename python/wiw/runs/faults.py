@@ -34,12 +34,14 @@ def find_remedy(path: Path, error: str, home: Path | None = None) -> str:
     """Return what was expected of the run store at `path` and what to do, given the text of an SQLite error."""
     if any(words in error for words in _UNWRITTEN):
         return (
-            f"expected free space, and the right to write, in {path.parent}. What was recorded before is kept: "
-            f"make room, then `wiw resume {(home or path).parent}`"
+            f"expected {path.parent} to be writable, with free space. Everything recorded so far is kept: make room, "
+            f"then `wiw resume {(home or path).parent}`"
         )
     if any(words in error for words in _DAMAGED):
         return (
-            f"expected a whole, undamaged run store; bring back {path.name} (and {path.name}-wal, where there is one) "
-            "from a copy, or begin a new run in another folder"
+            f"expected a complete, undamaged run store; restore {path.name} (and {path.name}-wal, if there is one) "
+            "from a backup, or start a new run in another folder"
         )
-    return "expected a run store that can be read and written; see that no other program holds it, then try again"
+    return (
+        "expected a run store that can be read and written; make sure that no other program has it open, then try again"
+    )

@@ -24,7 +24,7 @@ SIDE = (256, 256)
 SPEED = 2.0
 """Speed of a film against what happened."""
 RATE = 15.0
-"""Frames a second, as shown."""
+"""Frames per second, as shown."""
 MOST = 200
 """Frames of a film; a longer episode goes by faster."""
 LAST = 1500

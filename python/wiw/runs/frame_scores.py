@@ -110,7 +110,7 @@ class FrameScores:
         if found != (APPLICATION_ID, VERSION):
             raise StoreError(
                 f"{self.path}: expected scores of frames (application id {APPLICATION_ID:#x}, version {VERSION}), got "
-                f"{found[0]:#x}, version {found[1]}; move the file away to have them made again"
+                f"{found[0]:#x}, version {found[1]}; move the file away to have them computed again"
             )
 
     @contextmanager
@@ -119,8 +119,8 @@ class FrameScores:
             yield
         except (sqlite3.Error, ValueError) as error:
             raise StoreError(
-                f"{self.path}: {error}; expected scores of frames in a folder with free space and the right to write. "
-                "Nothing else is in the file: move it away to have the scores made again"
+                f"{self.path}: {error}; expected scores of frames in a writable folder with free space. The file "
+                "contains nothing else: move it away to have the scores computed again"
             ) from error
 
 

@@ -155,7 +155,7 @@ def _measure(jpeg: bytes) -> tuple[int, int]:
         with Image.open(io.BytesIO(jpeg)) as image:
             return image.height, image.width
     except OSError as error:
-        raise StoreError(f"a picture of {len(jpeg)} bytes is no JPEG; the run store is damaged") from error
+        raise StoreError(f"a picture of {len(jpeg)} bytes is not a JPEG; the run store is damaged") from error
 
 
 def _cut_frame(strip: NDArray[np.uint8], place: FramePlace, view: int) -> NDArray[np.uint8]:

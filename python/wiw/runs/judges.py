@@ -20,7 +20,7 @@ JUDGE_ERROR = "judge/"
 NOT_JUDGED = "judge/missing"
 """Kind of an outcome that a judge has not been asked about."""
 _SHORT_NAMES = {"rules": "rules+approximate"}
-"""Names of judges as they are asked for, where they differ from what these call themselves."""
+"""Names of judges as they are requested, where they differ from what these call themselves."""
 OWN = "own"
 """Names the judge that the run was made with."""
 
@@ -71,7 +71,7 @@ class JudgedRow:
     metrics: Mapping[str, float]
     details: Mapping[str, Any]
     error: str = ""
-    """Why there are no marks; empty where there are."""
+    """Why there are no marks; empty if there are."""
     kind: str = ""
 
     @property
@@ -110,9 +110,9 @@ def find_judge(judges: Sequence[JudgeRecord], name: str | None, place: str) -> J
         return found[0]
     listed = "; ".join(judge.full_label + (" (the run's own)" if judge.own else "") for judge in judges)
     if found:
-        raise ArgumentError(f"judge '{name}': {len(found)} judges of {place} go by that; name a digest: {listed}")
+        raise ArgumentError(f"judge '{name}': {len(found)} judges of {place} match this name; give a digest: {listed}")
     raise ArgumentError(
-        f"judge '{name}': {place} has no marks by it. It has those by: {listed}. `wiw judge {place}` adds some"
+        f"judge '{name}': {place} has no marks by it, only by: {listed}. `wiw judge {place}` adds marks"
     )
 
 
@@ -138,7 +138,7 @@ def _apply_judge(row: dict[str, Any], judged: Mapping[str, Any] | None, judge: J
         return {**row, **judged}
     if judge.own:
         return row
-    said = f"not judged yet by {judge.full_label}; `wiw judge RUN` with that judge asks for what is missing"
+    said = f"not judged yet by {judge.full_label}; `wiw judge RUN` with that judge requests the missing marks"
     return {**row, "status": "error", "metrics": {}, "details": {}, "error": said, "kind": NOT_JUDGED}
 
 

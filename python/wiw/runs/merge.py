@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Merge the stores of a run's shards into one run, equal to what one process would have recorded.
+"""Merge the stores of a run's shards into one run, identical to what a single process would have recorded.
 
-Equal are all rows of episodes, outcomes, decisions, pictures, films and maps. Excepted are times (`seconds`), `spent`
-and `calls` as far as they depend on which episodes were live together, and what `info` says of machines and commands.
+All rows of episodes, outcomes, decisions, images, films and maps are equal. Exceptions are times (`seconds`), `spent`
+and `calls` as far as they depend on which episodes ran together, and what `info` says about machines and commands.
 """
 
 from __future__ import annotations
@@ -37,34 +37,34 @@ class Merged:
     run: Path
     stores: int
     ended: int
-    """Episodes of all arms that have ended."""
+    """Number of finished episodes over all arms."""
     pending: Mapping[str, int]
-    """By arm: episodes that no store has ended; arms without any are left out."""
+    """By arm: number of episodes that no store has finished; arms without any are left out."""
     repeated: int
-    """Episodes that several stores had, all with the same record."""
+    """Number of episodes that several stores had, all with the same record."""
     unlike: tuple[str, ...]
-    """Episodes that several stores had with unlike records, where none is promised to be equal; the first was taken.
+    """Episodes that several stores had with different records, where equality is not guaranteed; the first was taken.
     E.g. "vlm episode 3: decision 0: note: recorded ..., now ...": the first difference."""
     undrawn: str = ""
-    """Reason why scene maps and films could not be drawn here; empty where they were."""
+    """Why scene maps and films could not be rendered here; empty if they were."""
 
     @property
     def complete(self) -> bool:
-        """Whether every arm has ended every episode."""
+        """Whether every arm has finished every episode."""
         return not self.pending
 
     def __str__(self) -> str:
-        lines = [f"{self.run}: {self.ended} episodes of {self.stores} stores"]
+        lines = [f"{self.run}: {self.ended} episodes from {self.stores} stores"]
         if self.repeated:
             lines.append(f"{self.repeated} of them were in several stores, with equal records")
         if self.unlike:
-            lines.append(f"{len(self.unlike)} were in several stores with unlike records; the first was taken:")
+            lines.append(f"{len(self.unlike)} were in several stores with different records; the first was taken:")
             lines += [f"  {text}" for text in self.unlike]
         if self.pending:
             left = ", ".join(f"{arm} {count}" for arm, count in self.pending.items())
             lines.append(f"episodes that no store has: {left}; run them with `wiw resume {self.run}`")
         if self.undrawn:
-            lines.append(f"scene maps and films could not be drawn here: {self.undrawn}")
+            lines.append(f"scene maps and films could not be rendered here: {self.undrawn}")
         return "\n".join(lines)
 
 
@@ -72,21 +72,21 @@ def merge(stores: Sequence[str | Path], out: str | Path, scratch: str | Path | N
     """Merge the stores of shards, or of the same run in other places, into one run.
 
         wiw.merge(["/scratch/a/1", "/scratch/a/2"], out="runs/a")
-        wiw.merge(["runs/a"], out="runs/whole")        # all stores in folders of runs/a
+        wiw.merge(["runs/a"], out="runs/whole")        # all stores in subfolders of runs/a
 
-    An episode that several stores have is taken from the first that has ended it without an error. Their records must
-    be equal where that is promised: built-in parts without weights, on machines of the same kind. Elsewhere unlike ones
-    are counted. Stores may still be written, and episodes may be missing: `wiw resume` runs these.
+    An episode found in several stores is taken from the first that has finished it without an error. Their records must
+    be equal if that is guaranteed (built-in parts without weights, on machines of the same kind); otherwise differing
+    ones are counted. Stores may still be in use, and episodes may be missing: `wiw resume` runs these.
 
     Args:
-        stores: folders with a store, or with folders that have one.
-        out: folder of the merged run, on any disk: the store is complete there or absent.
-        scratch: folder on a local disk in which it is written; the system's for temporary files if not given.
+        stores: folders with a store, or with subfolders that have one.
+        out: folder of the merged run, on any disk; the store there is either complete or absent.
+        scratch: folder on a local disk in which it is written first; by default the system's temporary folder.
 
     Raises:
         ArgumentError: no folder is given.
-        StoreError: no store; manifests that differ, naming the difference; unlike records of an episode for which equal
-            ones are promised; `out` holds a run already.
+        StoreError: no store; manifests that differ, naming the difference; different records of an episode for which
+            equality is guaranteed; `out` already holds a run.
         FileError: `out` or `scratch` cannot be written.
     """
     with ExitStack() as stack:
@@ -114,15 +114,15 @@ def require_equal_manifests(stores: Sequence[RunStore]) -> None:
     """Check that stores are of the same run: versions, task, seed, arms, episodes, scenes, source files, measurements.
 
     Raises:
-        StoreError: two differ; says in what, and which they are.
+        StoreError: two differ; says which ones, and how.
     """
     first = stores[0]
     manifest = _read_manifest(first)
     for other in stores[1:]:
         for place, here, there in _compare(manifest, _read_manifest(other), ""):
             raise StoreError(
-                f"{first.path.parent} and {other.path.parent} are not of the same run: {place}: "
-                f"{_show(here)} and {_show(there)}; expected stores of one command that differ in --shard alone"
+                f"{first.path.parent} and {other.path.parent} are not from the same run: {place}: {_show(here)} and "
+                f"{_show(there)}; expected stores of one command that differ only in --shard"
             )
     known: dict[str, tuple[Path, Any]] = {}  # by arm: a store has built the agents of those that it has begun
     for store in stores:
@@ -130,7 +130,7 @@ def require_equal_manifests(stores: Sequence[RunStore]) -> None:
             folder, own = known.setdefault(arm, (store.path.parent, agent))
             for place, here, there in _compare(own, agent, f"agent {arm}"):
                 raise StoreError(
-                    f"{folder} and {store.path.parent} had unlike agents: {place}: {_show(here)} and "
+                    f"{folder} and {store.path.parent} had different agents: {place}: {_show(here)} and "
                     f"{_show(there)}; expected the same weights and options everywhere"
                 )
 
@@ -181,25 +181,25 @@ def _choose_sources(parts: Sequence[RunStore]) -> tuple[list[set[Key]], int, lis
 def _find_difference(
     parts: Sequence[RunStore], first: tuple[int, Mapping[str, Any]], other: tuple[int, Mapping[str, Any]]
 ) -> str:
-    """Return the first difference between two records of an episode; empty where they are equal.
+    """Return the first difference between two records of an episode; empty if they are equal.
 
     Raises:
-        StoreError: they differ though they are promised to be equal.
+        StoreError: they differ although equality is guaranteed.
     """
     (store, row), (store_there, row_there) = ((parts[index], row) for index, row in (first, other))
     facts, facts_there = read_facts(store, row), read_facts(store_there, row_there)
     text = next(list_differences(facts, facts_there), "")
     if text and _is_promised(store, row["arm"], facts) and store.info["platform"] == store_there.info["platform"]:
         raise StoreError(
-            f"{row['arm']} episode {row['episode']} has unlike records in {store.path.parent} and "
-            f"{store_there.path.parent}, though equal ones are promised of its parts on equal machines: {text}. "
-            "Find out which is right with `wiw verify`, and merge without the other"
+            f"{row['arm']} episode {row['episode']} has different records in {store.path.parent} and "
+            f"{store_there.path.parent}, although its parts guarantee equal ones on equal machines: {text}. Find out "
+            "which is right with `wiw verify`, and merge without the other"
         )
     return f"{row['arm']} episode {row['episode']}: {text}" if text else ""
 
 
 def _is_promised(store: RunStore, arm: str, facts: Sequence[tuple[str, Mapping[str, Any]]]) -> bool:
-    """Return whether results are promised to be equal on equal machines: built-in parts, no weights, no server."""
+    """Return whether results are guaranteed to be equal on equal machines: built-in parts, no weights, no server."""
     task, agent = store.info["task"], store.info["agents"][arm]
     if task is None or agent is None or task["name"] not in TASKS.built_in:
         return False
@@ -209,7 +209,7 @@ def _is_promised(store: RunStore, arm: str, facts: Sequence[tuple[str, Mapping[s
 
 
 def _needs_nothing(model: str | None) -> bool:
-    """Return whether a world model is a built-in one without packages, weights or servers of its own."""
+    """Return whether a world model is built in and needs no packages, weights or servers."""
     if model is None:
         return True
     found = WORLD_MODELS.find(model) if model in WORLD_MODELS.built_in else None
@@ -217,7 +217,7 @@ def _needs_nothing(model: str | None) -> bool:
 
 
 def _merge_info(parts: Sequence[RunStore]) -> dict[str, Any]:
-    """Return the first store's info as that of the whole run, and where each part is from."""
+    """Return the first store's info for the whole run, with the origin of each part."""
     infos = [part.info for part in parts]
     named = ("shard", "platform", "command", "preparation_seconds", "session")
     info = {name: value for name, value in infos[0].items() if name not in ("shard", "session")}
@@ -231,7 +231,7 @@ def _merge_info(parts: Sequence[RunStore]) -> dict[str, Any]:
 
 
 def _draw_pictures(store: RunStore) -> str:
-    """Draw maps and films as at the end of a run; return why that cannot be done here."""
+    """Render maps and films as at the end of a run; return why that is impossible here, if so."""
     try:
         task, _ = read_recipes(store)
         draw_pictures(store, task.build())

@@ -125,7 +125,7 @@ def _update_built(agent: Any) -> Any:
 
 
 def _parse_object(text: Any) -> dict[str, Any] | None:
-    """Return the JSON object that a column holds; None where it holds something else, which its reader refuses."""
+    """Return the JSON object that a column holds; None if it holds something else, which its reader refuses."""
     try:
         value = json.loads(text)
     except (TypeError, ValueError):

@@ -19,8 +19,8 @@ def parse_options(pairs: Sequence[str], factory: Callable[..., Any], flag: str) 
     """`["steps=30", "size=[480, 480]"]` as options of a factory.
 
     A value is read as YAML (number, true, [list], text); it stays text where the factory's parameter is annotated as
-    such, so that a revision of digits is no number. The brackets of a list may be left out where it is annotated as a
-    sequence: `categories=bed,coffee table`. Files and folders that are there are named from the root on, so that a run
+    such, so that a revision of digits is not a number. The brackets of a list may be left out where it is annotated as
+    a sequence: `categories=bed,coffee table`. Files and folders that exist are named from the root on, so that a run
     can be resumed from any folder.
 
     Raises:
@@ -46,12 +46,12 @@ def parse_options(pairs: Sequence[str], factory: Callable[..., Any], flag: str) 
         try:
             options[name] = path or (value if annotation.startswith("str") else yaml.safe_load(value))
         except yaml.YAMLError as error:
-            raise ArgumentError(f"{flag}: {pair}: the value is no YAML ({error})") from None
+            raise ArgumentError(f"{flag}: {pair}: the value is not valid YAML ({error})") from None
     return options
 
 
 def _make_absolute(value: str) -> str | None:
-    """Return the absolute path of a file or folder that is there."""
+    """Return the absolute path of a file or folder that exists."""
     try:
         path = Path(value).expanduser()
         return str(path.resolve()) if value and path.exists() else None

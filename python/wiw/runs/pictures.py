@@ -16,7 +16,7 @@ from wiw.types import Episode
 POOL = 12
 """Episodes that keep pictures during a run; more if more are to keep them after it."""
 FLOORS, CEILING, CONTROL = ("copy", "none"), "oracle", "placebo"
-"""Names of arms that are no model under test; of the floors the first that the run has counts."""
+"""Names of arms that are not models under test; of the floors the first that the run has counts."""
 
 
 def spread_evenly(episodes: Sequence[Episode], count: int) -> list[int]:

@@ -26,7 +26,7 @@ def is_running(session: Mapping[str, Any]) -> bool:
 
 
 def _read_start(process: int) -> int | None:
-    """Return field 22 of /proc/PID/stat (proc(5)); None where there is no such process, or a zombie."""
+    """Return field 22 of /proc/PID/stat (proc(5)); None if there is no such process, or a zombie."""
     try:
         state, *fields = Path("/proc", str(process), "stat").read_text().rpartition(")")[2].split()
     except OSError:

@@ -20,7 +20,7 @@ class ArmProgress:
     total: int
     """Episodes of the arm, those included that ended before this process began."""
     decisions_each: int = 1
-    """Most decisions an episode may take; ends early where the goal is reached."""
+    """Maximum number of decisions an episode may take; ends early where the goal is reached."""
     ended: int = 0
     errors: int = 0
     successes: float = 0.0
@@ -156,7 +156,7 @@ class SilentBoard:
 
 
 class TerminalBoard:
-    """Rich bars; plain lines at quarter marks where the output is no terminal."""
+    """Rich bars; plain lines at quarter marks where the output is not a terminal."""
 
     def __init__(self) -> None:
         from rich.console import Console
@@ -230,7 +230,7 @@ class NotebookBoard:
         self._handle = display(HTML(""), display_id=True)
 
     def show(self, arm: str, progress: Progress) -> None:
-        """Redraw, at most five times a second."""
+        """Redraw, at most five times per second."""
         self._arms[arm] = progress
         if time.monotonic() - self._shown > 0.2:
             self._draw()
@@ -265,7 +265,7 @@ def make_board(wanted: bool) -> Board:
 
 
 def in_notebook() -> bool:
-    """Return whether the value of a cell is shown by itself, so that printing it would show it twice."""
+    """Return whether a notebook shows the value of this cell, so that printing it would show it twice."""
     if "IPython" not in sys.modules:  # a notebook has it loaded, and elsewhere loading it takes longer than a short run
         return False
     from IPython import get_ipython

@@ -42,7 +42,7 @@ from wiw.runs.workers import (
 from wiw.types import Episode, EpisodeResult
 
 TRIES = 3
-"""How often an episode is begun whose actor, or whose server, is lost."""
+"""How often an episode is started if its actor or server is lost."""
 UNREACHABLE = ("connection", "unreachable")
 """Kinds of errors that say that a server was lost, of world models and of language models."""
 TOGETHER = 0.02
@@ -173,7 +173,7 @@ class _ActorPool:
         if not ready and not any(lease.job for lease in self._leases):
             raise InfrastructureError(self._describe_shortage(serves))
         for pool in (self._models, self._vlms):
-            pool.tend(ready)
+            pool.update_servers(ready)
         for lease in [lease for lease in self._leases if lease.rows in ready]:
             self._receive(lease)
 
@@ -223,7 +223,7 @@ class _ActorPool:
             self._replace(lease, error)
             return
         except self._ray.exceptions.RayTaskError as error:
-            raise InfrastructureError(f"an actor of Ray failed: {error}") from error
+            raise InfrastructureError(f"a Ray actor failed: {error}") from error
         for row in rows:
             self._receive_row(lease, lease.job, row)
 
@@ -262,7 +262,7 @@ class _ActorPool:
         lease.unfinished = {index: own for index, own in lease.unfinished.items() if index not in episodes}
 
     def _withdraw_jobs(self) -> None:
-        """End all actors; what they have not finished is run by others, and this is no try of theirs."""
+        """End all actors; what they have not finished is run by others, and this is not a try of theirs."""
         for lease in self._leases:
             self._ray.kill(lease.actor)
             if lease.job is not None and lease.unfinished:
@@ -294,5 +294,5 @@ class _ActorPool:
         self._leases.remove(lease)
         cause = str(error).strip().splitlines()[0]
         if lease.job is None:
-            raise InfrastructureError(f"an actor of Ray could not start: {error}") from error
+            raise InfrastructureError(f"a Ray actor could not start: {error}") from error
         self._jobs.extend(lease_again(lease.job, lease.unfinished, self._receiver, TRIES, cause))

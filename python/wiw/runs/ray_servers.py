@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """Servers of a run as Ray actors: each starts `wiw serve` or `wiw serve-vlm`, and one that is lost is started again.
 
-An actor gets its GPUs of Ray and starts the command as a process of its own, which ends with the actor; a server that
+An actor gets its GPUs of Ray and starts the command as a separate process, which ends with the actor; a server that
 crashes takes nothing else with it. A server comes back at its address where its node is still there, and clients repeat
 what it has not answered; at another address the run's workers are told the new one.
 """
@@ -75,7 +75,7 @@ class ServerActor:
     def wait(self) -> str:
         """Return why the server has ended, once it has."""
         assert self._process is not None
-        return f"exit code {self._process.wait()}; its latest output: {self._read_output() or 'none'}"
+        return f"exit code {self._process.wait()}; its last output: {self._read_output() or 'none'}"
 
     def _await_announcement(self, file: Path) -> ServerAddress:
         assert self._process is not None
@@ -85,7 +85,7 @@ class ServerActor:
                 raise InfrastructureError(self.wait())
             if time.monotonic() > give_up:
                 self._process.kill()
-                raise InfrastructureError(f"it did not serve within {START_SECONDS:g} s; {self.wait()}")
+                raise InfrastructureError(f"it did not start serving within {START_SECONDS:g} s; {self.wait()}")
             time.sleep(GLANCE)
         return found[0]
 
@@ -144,15 +144,15 @@ class ServerPool:
 
     @property
     def refs(self) -> list[Any]:
-        """References to wait for: one that is ready is news of a server, which `tend` deals with."""
+        """References to wait for: one that is ready is news of a server, which `update_servers` deals with."""
         return [server.ref for server in self._servers]
 
     def start(self) -> None:
-        """Start all servers, at the same time; `tend` tells when they serve."""
+        """Start all servers, at the same time; `update_servers` tells when they serve."""
         for server in self._servers:
             self._start(server)
 
-    def tend(self, ready: Sequence[Any]) -> None:
+    def update_servers(self, ready: Sequence[Any]) -> None:
         """Deal with servers that have begun to serve, or are lost.
 
         Raises:
@@ -190,7 +190,7 @@ class ServerPool:
         server.ref = server.actor.start.remote(server.port if server.lost < TRIES - 1 else 0)
 
     def _make_actor(self, server: _Server) -> Any:
-        """Return an actor, on the node where the server was before if that is there."""
+        """Return an actor, on the node where the server was before if that exists."""
         from ray.util.scheduling_strategies import NodeAffinitySchedulingStrategy
 
         place: Any = "SPREAD" if server.node is None else NodeAffinitySchedulingStrategy(server.node, soft=True)
@@ -211,8 +211,8 @@ class ServerPool:
         if not self._servers:
             command = shlex.join(["wiw", *server.command.arguments])
             raise LostServersError(
-                f"the last server was lost {TRIES} times while no episode ended: {command}: {cause}. Mend "
-                "it, then `wiw resume`, with --retry-errors for the episodes that were asking it"
+                f"the last server was lost {TRIES} times without any episode finishing: {command}: {cause}. Fix it, "
+                "then `wiw resume`, with --retry-errors for the episodes that were using it"
             )
 
 

@@ -12,25 +12,25 @@ from typing import Any, cast
 from wiw.envs.base import Env
 from wiw.errors import ArgumentError
 from wiw.experiments.counterparts import is_counterpart
-from wiw.experiments.errors import make_error
 from wiw.experiments.errors.erroneous import require_error
+from wiw.experiments.errors.kinds import make_error
 from wiw.experiments.placebos import PLACEBOS, require_words
 from wiw.loop.agent import Agent
 from wiw.loop.agent_spec import AgentSpec, space_option
 from wiw.loop.base import BaseAgent
 from wiw.loop.config import AgentConfig
 from wiw.loop.imagination import Imaginer
-from wiw.loop.limits import Limits
 from wiw.loop.observers import Observer
 from wiw.policies.base import Policy
 from wiw.registry import ISOLATED, POLICIES, SEMANTICS, TRACKERS, WORLD_MODELS
 from wiw.runs.arm_text import EXAMPLE, ArmText, check_arm_name, parse_arm
 from wiw.runs.compose import Experiment, RunContext, compose, make_for_space, require_placebo
+from wiw.runs.limits import Limits
 from wiw.runs.part_options import parse_options
 from wiw.runs.sources import source_digests
 from wiw.tasks.base import Task
 from wiw.types import PRIMITIVES
-from wiw.world_models.base import WorldModel
+from wiw.world_models.base import WorldModel, find_accepts
 
 PLACEBO, PLACEBO_MODEL = "placebo-", "warp"
 """Beginning of the names of placebo arms, and the model that they use where nobody names one."""
@@ -72,7 +72,9 @@ class TaskRecipe:
         preset = load_preset(find_owner(kind), self.options.get("preset") or DEFAULT)
         policy = preset.policy or kind.default_policy
         if policy is None:
-            raise ArgumentError(f"--policy: task '{self.name}' names no default; choose one of `wiw list policies`")
+            raise ArgumentError(
+                f"--policy: task '{self.name}' has no default policy; choose one from `wiw list policies`"
+            )
         return str(policy)
 
     def to_json(self) -> dict[str, Any]:
@@ -234,8 +236,8 @@ class AgentRecipe(AgentConfig):
         said = task.describe()
         if (self.tracker or self.tracker_options) and not said.get("categories"):
             raise ArgumentError(
-                f"tracker: task '{said.get('task', 'of this run')}' points nothing out that could be followed; name a "
-                "tracker for task ar alone"
+                f"tracker: task '{said.get('task', 'of this run')}' has no target to track; give a tracker only for "
+                "task ar"
             )
         if self.placebo is not None:
             require_placebo(self.placebo, self.find_space(task), episodes)
@@ -288,8 +290,9 @@ class AgentRecipe(AgentConfig):
         revising = self._find_reviser(task)
         if not isinstance(revising, str) or "tracker" not in inspect.signature(POLICIES.find(revising)).parameters:
             raise ArgumentError(
-                f"tracker: policy {revising if isinstance(revising, str) else type(revising).__name__} takes none; "
-                "expected one that revises by name and looks for a target in imagined frames, such as vlm or recogniser"
+                f"tracker: policy {revising if isinstance(revising, str) else type(revising).__name__} does not use "
+                "one; expected a revision policy given by name that looks for a target in imagined frames, such as "
+                "vlm or recogniser"
             )
         if revising is self.policy:
             return self._make_policy(revising, space, task, tracker), None
@@ -322,15 +325,15 @@ def _unwrap(part: Any) -> Any:
 
 
 def find_control(model: Any) -> str:
-    """Return how a world model, or one of that name, is told plans; empty where only the model itself can say."""
-    found = WORLD_MODELS.find(model) if isinstance(model, str) else model
-    return str(getattr(getattr(found, "accepts", None), "control", ""))
+    """Return how a world model, or one of that name, is told plans; empty if only the model itself can say."""
+    declared = find_accepts(WORLD_MODELS.find(model) if isinstance(model, str) else model)
+    return declared.control if declared else ""
 
 
 def _has_simulator(model: Any) -> bool:
-    """Return whether a world model, or one of that name, is handed the simulator; of the built-in ones oracle is."""
-    found = WORLD_MODELS.find(model) if isinstance(model, str) else model
-    return model == ERROR_MODEL or "simulator" in getattr(getattr(found, "accepts", None), "needs", ())
+    """Return whether a world model, or one of that name, is given the simulator; of the built-in ones oracle is."""
+    declared = find_accepts(WORLD_MODELS.find(model) if isinstance(model, str) else model)
+    return model == ERROR_MODEL or (declared is not None and "simulator" in declared.needs)
 
 
 def _describe(part: Any) -> Any:
@@ -395,7 +398,7 @@ def task_recipe(task: Any, options: Mapping[str, Any] | None = None) -> TaskReci
 
         return TaskRecipe(task_name(task), dict(options or {}))
     if options:
-        raise ArgumentError(f"the task is made already and cannot take {', '.join(options)}; give them to wiw.make")
+        raise ArgumentError(f"the task already exists and cannot take {', '.join(options)}; give them to wiw.make")
     if isinstance(task, TaskRecipe):
         return task
     return TaskInMemory(task if isinstance(task, Task) else _task_of(task))
@@ -410,14 +413,14 @@ def _task_of(env: Any) -> Task:
     bare = env.unwrapped if isinstance(env, gymnasium.Env | gymnasium.vector.VectorEnv) else env
     if isinstance(bare, Env | VectorEnv | ManipulationVectorEnv) and isinstance(bare.task, Task):
         return bare.task
-    raise ArgumentError(f"expected a task (wiw.Task), the name of one, or an environment of wiw.make, got {env!r}")
+    raise ArgumentError(f"expected a task (wiw.Task), its name, or an environment from wiw.make, got {env!r}")
 
 
 def agent_recipe(agent: Any) -> AgentRecipe | AgentInMemory:
     """Return a recipe of an agent.
 
     Raises:
-        ArgumentError: it is no agent.
+        ArgumentError: it is not an agent.
     """
     if isinstance(agent, AgentRecipe):
         return agent
@@ -437,19 +440,19 @@ def arm_recipes(agent: Any, arms: Any) -> dict[str, AgentRecipe | AgentInMemory]
 
     Raises:
         ArgumentError: an arm is named twice, or none is; a name that is empty, has forbidden characters or is a
-            reference's; options that are no KEY=VALUE; an agent of another method, which has no world model.
+            reference's; options that are not KEY=VALUE; an agent of another method, which has no world model.
     """
     recipe = agent_recipe(agent)
     if arms is None:
         return {_name_own_arm(agent, recipe): recipe}
     if not isinstance(recipe, AgentRecipe):
-        raise ArgumentError(f"arms: {type(agent).__name__} has no world model that could be another")
+        raise ArgumentError(f"arms: {type(agent).__name__} has no world model to replace")
     pairs = arms.items() if isinstance(arms, Mapping) else [(None, model) for model in arms]
     made = [_make_arm(recipe, name, model) for name, model in pairs]
     if len(dict(made)) < max(1, len(made)):
         raise ArgumentError(
-            f"arms: expected different world models, got {[name for name, _ in made]}; one model may be several arms "
-            f"with names of their own: {EXAMPLE}"
+            f"arms: expected different world models, got {[name for name, _ in made]}; to run one model as several "
+            f"arms, name them: {EXAMPLE}"
         )
     return dict(made)
 
@@ -470,7 +473,7 @@ def _make_arm(agent: AgentRecipe, name: str | None, model: Any) -> tuple[str, Ag
         return changed.arm if name is None else name, changed
     arm = parse_arm(model or "none")
     if name is not None and arm.name is not None:
-        raise ArgumentError(f"arms: '{model}' has the names '{name}' and '{arm.name}'; expected one of them")
+        raise ArgumentError(f"arms: '{model}' is named both '{name}' and '{arm.name}'; give one name")
     policy, rest = _split_policy(arm.model)
     repeats, of_model = _split_repeat(rest)
     own = agent if policy is None else agent.with_policy(policy)
@@ -490,7 +493,7 @@ def require_reference(name: str, agent: AgentRecipe) -> AgentRecipe:
     is_changed = any(change is not None for change in (agent.placebo, agent.error, agent.reseed))
     if name in REFERENCES and (agent.arm != name or is_changed):
         raise ArgumentError(
-            f"arms: reports take the arm '{name}' for the reference '{name}', got {agent.model}; choose another name"
+            f"arms: the name '{name}' is reserved for the reference '{name}', got {agent.model}; choose another name"
         )
     return agent
 
@@ -504,7 +507,7 @@ def require_semantics_use(agents: Mapping[str, AgentRecipe | AgentInMemory]) -> 
     recipes = [recipe for recipe in agents.values() if isinstance(recipe, AgentRecipe) and recipe.semantics is not None]
     if recipes and all(recipe.model is None for recipe in recipes):
         raise ArgumentError(
-            "semantics: labels are for a world model, and no arm has one: give --world-model or leave semantics out"
+            "semantics: labels are for a world model, but no arm has one: give --world-model or leave semantics out"
         )
 
 
@@ -526,7 +529,7 @@ def _with_options(agent: AgentRecipe, arm: ArmText) -> AgentRecipe:
     if not arm.options:
         return agent
     if not isinstance(agent.model, str):
-        raise ArgumentError(f"arms: '{arm}' has options and no world model to take them; expected one by name")
+        raise ArgumentError(f"arms: '{arm}' has options but no named world model to take them")
     options = parse_options(arm.options, WORLD_MODELS.find(agent.model), f"arms: '{arm}'")
     return replace(agent, model_options={**agent.model_options, **options})
 

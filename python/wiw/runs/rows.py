@@ -19,7 +19,8 @@ from wiw.types import Answer, ArmObservation, DecisionRecord, Episode, EpisodeRe
 STRIP_HEIGHT = 160
 JPEG_QUALITY = 85
 MOST_FRAMES = 20
-"""Most frames of a rollout that are kept as pictures: a JPEG has room for 65535 pixels, a reader for fewer."""
+"""Maximum number of frames of a rollout that are kept as pictures: a JPEG has room for 65535 pixels, a reader for
+fewer."""
 
 
 @dataclass(frozen=True)
@@ -210,7 +211,7 @@ def decode_jpeg(data: bytes) -> NDArray[np.uint8]:
     """Return RGB image [H, W, 3] from JPEG bytes."""
     image = cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_COLOR)
     if image is None:
-        raise StoreError(f"a picture of {len(data)} bytes is no JPEG; the run store is damaged")
+        raise StoreError(f"a picture of {len(data)} bytes is not a JPEG; the run store is damaged")
     return np.asarray(cv2.cvtColor(image, cv2.COLOR_BGR2RGB), np.uint8)
 
 

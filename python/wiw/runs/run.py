@@ -53,17 +53,17 @@ class Run:
 
     @property
     def episodes(self) -> Records:
-        """Ended episodes of all arms: arm, episode, scene, status, metrics, seconds, error."""
+        """Finished episodes of all arms: arm, episode, scene, status, metrics, seconds, error."""
         return Records(self.store.outcomes())
 
     @property
     def decisions(self) -> Records:
-        """Decisions of all ended episodes: proposals, scores, choice, what was executed, truth before and after."""
+        """Decisions of all finished episodes: proposals, scores, choice, executed actions, truth before and after."""
         return Records(self.store.decisions())
 
     @property
     def tables(self) -> TableSpec:
-        """Return what its task has tables and plots show; of older runs, what the task says now."""
+        """Return what the task's tables and plots show; for older runs, what the task says now."""
         kept, task = self.store.info.get("tables"), self.store.config["task"].get("task")
         if kept is not None:
             values: dict[str, Any] = {str(name): tuple(v) if isinstance(v, list) else v for name, v in kept.items()}
@@ -72,7 +72,7 @@ class Run:
 
     @property
     def complete(self) -> bool:
-        """Whether every arm has ended every episode."""
+        """Whether every arm has finished every episode."""
         return not any(self.store.pending(arm) for arm in self.arms)
 
     def close(self) -> None:
@@ -85,9 +85,9 @@ class Run:
 
 
 def find_stores(runs: Sequence[str | Path]) -> list[Path]:
-    """Return the folders with a store, each once: those given, and of folders without one those right inside.
+    """Return the folders with a store, each once: the given ones, or for folders without a store their subfolders.
 
-    Stores inside that are being created, or whose creation was cut off, are left out.
+    Stores inside that are being created, or whose creation was interrupted, are left out.
 
     Raises:
         ArgumentError: no folder is given.

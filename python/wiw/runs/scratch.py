@@ -37,7 +37,7 @@ class ScratchCopy:
         self.path = scratch.expanduser().resolve() / f"{own.parent.name}-{digest}" / own.name
         self._copied = time.monotonic()
 
-    def take_in(self) -> None:
+    def fetch_store(self) -> None:
         """Fetch the store from its home, unless a killed process has left more of the same run here.
 
         The caller holds the store's lock.
@@ -46,7 +46,7 @@ class ScratchCopy:
             StoreError: the store at home cannot be read, or the one here cannot be written.
         """
         with explain_faults(self.home), closing(_open(self.home, "ro")) as source:
-            if self._has_left_more(source):
+            if self._has_more_than(source):
                 return
             self.discard()
             with explain_faults(self.path, self.home), closing(sqlite3.connect(self.path)) as target:
@@ -84,7 +84,7 @@ class ScratchCopy:
         with suppress(OSError):  # other files are in it
             self.path.parent.rmdir()
 
-    def _has_left_more(self, home: sqlite3.Connection) -> bool:
+    def _has_more_than(self, home: sqlite3.Connection) -> bool:
         if not self.path.is_file():
             return False
         try:
@@ -113,8 +113,8 @@ def make_local_folder(parent: str | Path | None) -> Iterator[Path]:
         folder = tempfile.TemporaryDirectory(prefix="wiw-", dir=own)
     except OSError as error:
         raise FileError(
-            f"{own}: no folder can be made there ({error.strerror}); expected a local disk with free space and the "
-            "right to write: make room or name another with --scratch (scratch=)"
+            f"{own}: cannot create a folder there ({error.strerror}); expected a writable local disk with free space: "
+            "make room, or choose another with --scratch (scratch=)"
         ) from error
     with folder as path:
         yield Path(path)

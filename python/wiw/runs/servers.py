@@ -40,8 +40,8 @@ def require_servable(agents: Mapping[str, Any], config: EngineConfig) -> None:
     """
     if config.servers and config.engine != "ray":
         raise ArgumentError(
-            "evaluate: servers are actors of Ray, or jobs of `wiw submit`: give --engine ray (engine=), or start "
-            "`wiw serve` and name its address as --world-model"
+            "evaluate: servers are Ray actors, or jobs of `wiw submit`: give --engine ray (engine=), or start `wiw "
+            "serve` and give its address as --world-model"
         )
     if config.servers:
         find_served(agents, config.served)
@@ -66,12 +66,13 @@ def find_served(agents: Mapping[str, Any], named: str | None) -> AgentRecipe:
     found = [recipe for recipe in recipes if isinstance(recipe.model, str) and recipe.model == named]
     if not found:
         raise ArgumentError(
-            "servers: expected the name of one world model of the arms as --world-model or --served (served=), got "
-            f"{named or 'none'}; there are {', '.join(sorted(models)) or 'only references'}"
+            "servers: expected one of the arms' world models as --world-model or --served (served=), got "
+            f"{named or 'none'}; the arms have {', '.join(sorted(models)) or 'only references'}"
         )
     if any(recipe.model_options != found[0].model_options for recipe in found):
         raise ArgumentError(
-            f"servers: arms have '{named}' with different options, and all servers serve the same model; run them apart"
+            f"servers: arms have '{named}' with different options, but all servers serve the same model; run them "
+            "separately"
         )
     return found[0]
 
@@ -91,7 +92,7 @@ def find_served_vlm(agents: Mapping[str, Any]) -> str:
     }
     if len(found) != 1:
         raise ArgumentError(
-            "vlm_servers: expected one language model that is in the process that asks it, --vlm transformers:PATH or "
+            "vlm_servers: expected one language model that runs in the worker process, --vlm transformers:PATH or "
             f"mock, got {', '.join(sorted(found)) or 'none'}"
         )
     return found.pop()

@@ -93,7 +93,7 @@ def parse_column(column: str, text: Any, where: str) -> Any:
         _check(value, COLUMNS[column], "")
     except ValueError as error:
         name = column.rpartition(".")[2]
-        raise StoreError(f"{where}: {name}: {error}; the run store was edited: bring back a copy of it") from error
+        raise StoreError(f"{where}: {name}: {error}; the run store was edited: restore it from a backup") from error
     return value
 
 
@@ -107,7 +107,7 @@ def check_types(row: Mapping[str, Any], declared: Mapping[str, tuple[type, ...]]
         if name in declared and not isinstance(value, declared[name]):
             raise StoreError(
                 f"{where}: {name}: expected {declared[name][0].__name__}, got {type(value).__name__}; the run store "
-                "was edited: bring back a copy of it"
+                "was edited: restore it from a backup"
             )
 
 
@@ -125,7 +125,7 @@ def check_decision(row: Mapping[str, Any], where: str) -> None:
     if not fits or not chosen or not row["path"] or any(len(place) != 3 for place in row["path"]):
         raise StoreError(
             f"{where}: expected actions of one kind, a score and frames for each of {count} proposals, one of them "
-            "chosen, and a path of [x, y, z]; the run store was edited: bring back a copy of it"
+            "chosen, and a path of [x, y, z]; the run store was edited: restore it from a backup"
         )
 
 

@@ -39,8 +39,7 @@ class Shard:
         """
         if episodes < self.count:
             raise ArgumentError(
-                f"shard {self}: there are {episodes} episodes, so some shards would have none; "
-                f"expected at most {episodes} shards"
+                f"shard {self}: with {episodes} episodes some shards would be empty; expected at most {episodes} shards"
             )
         first, last = ((self.number - 1) * episodes // self.count, self.number * episodes // self.count)
         return range(first, last)

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The user's source files that a run depends on, so that one run never mixes two versions of a model or policy."""
+"""Track the user's source files that a run depends on, so that a run never mixes two versions of a model or policy."""
 
 from __future__ import annotations
 
@@ -22,15 +22,14 @@ LIBRARIES = (
     Path(wiw.__file__).resolve().parent,
     *(Path(sysconfig.get_path(name)).resolve() for name in ("stdlib", "platstdlib", "purelib", "platlib")),
 )
-"""Folders of code whose versions are known otherwise."""
+"""Folders of code whose versions are recorded elsewhere."""
 
 
 def source_digests(part: Any) -> dict[str, str]:
-    """Return digests by path of the files that define a class or function, or the class of an instance.
+    """Return the digests, by path, of the files that define a class or function, or the class of an instance.
 
-    With them go the classes that it derives from and the files beside them that they import, in functions too.
-    Installed packages are left out. Of a class in a script that is run itself, the class alone counts; of one in a
-    notebook there is no file.
+    This includes its base classes and the files next to them that they import, also inside functions, but not installed
+    packages. For a class in the main script, only the class counts; for one in a notebook there is no file.
     """
     own = part if inspect.isclass(part) else type(part)
     if issubclass(own, Isolated):
@@ -52,30 +51,31 @@ def source_digests(part: Any) -> dict[str, str]:
 
 
 def _digest_loaded(host: Host) -> dict[str, str]:
-    """Return the digests of what a process of its own has loaded."""
+    """Return the digests of what a separate process has loaded."""
     return source_digests(host.thing)
 
 
 def require_sources(run: Path, begun_with: Mapping[str, str] | None, now: Mapping[str, str]) -> None:
-    """Check that a run's source files are those it began with; a run without a record of them passes.
+    """Check that a run's source files are those it was started with; a run without a record of them passes.
 
     Raises:
-        StoreError: a file has changed, come or gone.
+        StoreError: a file has been changed, added or removed.
     """
     changed = [] if begun_with is None else [path for path in begun_with if begun_with[path] != now.get(path)]
     changed += [] if begun_with is None else [path for path in now if path not in begun_with]
     if changed:
         raise StoreError(
-            f"{run}: source files have changed since the run was begun: {', '.join(sorted(changed))}. Results of two "
-            "versions must not be mixed: begin a new run in another folder, or put the files back as they were"
+            f"{run}: source files have changed since the run was started: {', '.join(sorted(changed))}. Results of two "
+            "versions must not be mixed: start a new run in another folder, or restore the files"
         )
 
 
 def require_unchanged(begun_with: Mapping[str, str]) -> None:
-    """Check that a running run's source files have not changed: agents that are built later read them again.
+    """Check that the source files of a run in progress have not changed, as agents that are built later read them
+    again.
 
     Raises:
-        StoreError: a file has changed or gone.
+        StoreError: a file has been changed or removed.
     """
     files = {path: Path(path) for path in begun_with if SCRIPT not in path}
     now = {path: _digest(file.read_bytes()) for path, file in files.items() if file.is_file()}
@@ -83,7 +83,7 @@ def require_unchanged(begun_with: Mapping[str, str]) -> None:
 
 
 def file_exists(path: str) -> bool:
-    """Return whether the file of a digest is still there."""
+    """Return whether the file of a digest still exists."""
     return Path(path.partition(SCRIPT)[0]).is_file()
 
 
@@ -103,7 +103,7 @@ def _digest(content: bytes) -> str:
 
 
 def _find_source_file(thing: Any) -> Path | None:
-    """Return the file of the user's that defines a class or function."""
+    """Return the user's file that defines a class or function."""
     try:
         name = inspect.getsourcefile(thing)
     except (OSError, TypeError):
@@ -117,7 +117,7 @@ def _is_library(path: Path) -> bool:
 
 
 def _with_imports(file: Path) -> set[Path]:
-    """Return a file and those of the user's that it imports, directly or not."""
+    """Return a file and the user's files that it imports, directly or not."""
     found, waiting = set[Path](), [file]
     while waiting:
         path = waiting.pop()
@@ -128,7 +128,7 @@ def _with_imports(file: Path) -> set[Path]:
 
 
 def _list_imports(file: Path) -> Iterator[Path]:
-    """Return the files of the user's that a file imports."""
+    """Return the user's files that a file imports."""
     try:
         tree = ast.parse(file.read_bytes())
     except (SyntaxError, ValueError):  # no Python, such as an extension's source
@@ -144,7 +144,7 @@ def _list_imports(file: Path) -> Iterator[Path]:
 
 
 def _list_roots(file: Path) -> list[Path]:
-    """Return the folders from which a file imports: its own, as of a script, and that of its outermost package."""
+    """Return the folders from which a file imports: its own, as for a script, and that of its outermost package."""
     package = file.parent
     while (package / "__init__.py").is_file():
         package = package.parent
@@ -152,7 +152,7 @@ def _list_roots(file: Path) -> list[Path]:
 
 
 def _list_modules(roots: list[Path], name: str) -> Iterator[Path]:
-    """Return the files that an import of a dotted name runs: packages and module; the last part may be no module."""
+    """Return the files that importing a dotted name runs: packages and module; the last part need not be a module."""
     parts = name.split(".")
     for root in roots:
         for count in range(1, len(parts) + 1):

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""How far runs are. Only reads: safe while other processes write."""
+"""Report the progress of runs. Read-only, so safe while other processes write."""
 
 from __future__ import annotations
 
@@ -19,37 +19,38 @@ State = Literal["done", "running", "elsewhere", "stopped"]
 
 @dataclass(frozen=True)
 class StoreStatus:
-    """How far one store is."""
+    """The progress of one store."""
 
     store: Path
     shard: Shard | None
     of_run: int
     """Episodes of all arms of the whole run."""
     total: int
-    """Episodes of all arms that this store is for."""
+    """Episodes of all arms that belong to this store."""
     ended: int
     errors: int
     """Episodes that ended with an infrastructure error."""
     state: State
-    """Whether all have ended, a process of this machine runs them, or one of another machine did at the last write."""
+    """Whether all have finished, a process on this machine is running them, or one on another machine did at the last
+    write."""
     host: str
-    """Machine that last ran episodes; empty where none has."""
+    """Machine that last ran episodes; empty if none has."""
     written: datetime
-    """Last write of the file, or of its copy where the store is written on another disk."""
+    """Last write of the file, or of its copy if the store is written on another disk."""
     seconds_left: float | None
-    """Estimate from the episodes that have ended since the present process began; None where there are none."""
+    """Estimate from the episodes finished since the current process started; None if there are none."""
 
 
 @dataclass(frozen=True)
 class RunStatus:
-    """How far a run is, over all its stores; prints as a table."""
+    """The progress of a run over all its stores; prints as a table."""
 
     run: Path
     stores: tuple[StoreStatus, ...]
 
     @property
     def ended(self) -> int:
-        """Episodes of all arms that have ended."""
+        """Number of finished episodes over all arms."""
         return sum(store.ended for store in self.stores)
 
     @property
@@ -59,7 +60,7 @@ class RunStatus:
 
     @property
     def total(self) -> int:
-        """Episodes of all arms of the whole run, those included whose shards have no store yet; of several runs in
+        """Number of episodes over all arms of the whole run, including shards without a store yet; for several runs in
         one folder, of all of them.
         """
         if self._are_shards:
@@ -84,7 +85,7 @@ class RunStatus:
 
     @property
     def seconds_left(self) -> float | None:
-        """Estimated time until the last shard ends; None where any that is not done has no estimate."""
+        """Estimated seconds until the last shard finishes; None if an unfinished shard has no estimate."""
         left = [store.seconds_left for store in self.stores if store.state != "done"]
         known = [seconds for seconds in left if seconds is not None]
         return None if self.missing or len(known) < len(left) else max(known, default=0.0)
@@ -103,10 +104,10 @@ class RunStatus:
 
 
 def status(run: str | Path) -> RunStatus:
-    """Return how far a run is.
+    """Return the progress of a run.
 
     Args:
-        run: folder of a run, or one that holds the folders of its shards.
+        run: folder of a run, or one that contains the folders of its shards.
 
     Raises:
         StoreError: no store, or one that cannot be read.
@@ -137,7 +138,7 @@ def _read_status(folder: Path) -> StoreStatus:
 
 
 def _read_time(path: Path) -> datetime:
-    """Return when a store was last written; the latest transactions may lie in the log beside it."""
+    """Return when a store was last written; the latest transactions may be in the log next to it."""
     files = [path, path.with_name(f"{path.name}-wal")]
     return datetime.fromtimestamp(max(file.stat().st_mtime for file in files if file.exists()), timezone.utc)
 
@@ -155,7 +156,7 @@ def _find_state(session: Mapping[str, Any] | None, done: bool) -> State:
 def _estimate_left(
     session: Mapping[str, Any] | None, state: State, written: datetime, ended: int, total: int
 ) -> float | None:
-    """Return the seconds until all have ended, at the pace since the session began."""
+    """Return the seconds until all have finished, at the pace since the session began."""
     if state == "done":
         return 0.0
     if session is None or state == "stopped" or ended <= session["ended"]:

@@ -107,8 +107,8 @@ class RunStore:
         path = store_path(run) if copy is None else copy.path
         if cls.exists(run):
             raise StoreError(
-                f"{store_path(run)} holds a run already; continue it with `wiw resume {store_path(run).parent}` "
-                "(or evaluate(..., resume=True)), or give another output folder"
+                f"{store_path(run)} already holds a run; continue it with `wiw resume {store_path(run).parent}` (or "
+                "evaluate(..., resume=True)), or give another output folder"
             )
         make_folder(store_path(run))
         lock = lock_store(path) if copy is None else lock_both(copy)
@@ -116,7 +116,7 @@ class RunStore:
             copy.discard()
         store = cls(path, connect(path, lock), lock, copy)
         with store._close_on_error():
-            store._fill(created or _now(), config, info, episodes)
+            store._fill(created or _format_now(), config, info, episodes)
         return store
 
     def _fill(self, created: str, config: dict[str, Any], info: dict[str, Any], episodes: Iterable[Episode]) -> None:
@@ -172,7 +172,7 @@ class RunStore:
         """
         path = store_path(run)
         if scratch is not None and path.exists():
-            store = cls._take_in(ScratchCopy(path, Path(scratch)))
+            store = cls._open_scratch_copy(ScratchCopy(path, Path(scratch)))
         else:
             store = cls._open(path, lock_store(path) if path.exists() else None)
         with store._close_on_error():
@@ -193,8 +193,8 @@ class RunStore:
         """
         if self.wiw_version != wiw.__version__:
             raise StoreError(
-                f"{self.path} was begun by wiw {self.wiw_version}, this is {wiw.__version__}: results of two versions "
-                "must not be mixed; install that version or start a new run"
+                f"{self.path} was started by wiw {self.wiw_version}, this is {wiw.__version__}: results of two "
+                "versions must not be mixed; install that version or start a new run"
             )
         self.require_benchmark()
 
@@ -206,9 +206,9 @@ class RunStore:
         """
         if self.benchmark != benchmark.VERSION:
             raise StoreError(
-                f"{self.path} is of version {self.benchmark} of the benchmark, and this wiw runs version "
-                f"{benchmark.VERSION}, in which decisions differ (docs/results.md); use the wiw that began the run, or "
-                "start a new one. Its records can still be read, reported and exported"
+                f"{self.path} uses version {self.benchmark} of the benchmark, but this wiw runs version "
+                f"{benchmark.VERSION}, in which decisions differ (docs/results.md); use the wiw that started the run, "
+                "or start a new one. Its records can still be read, reported and exported"
             )
 
     def require_task(self, task: dict[str, Any]) -> None:
@@ -247,11 +247,11 @@ class RunStore:
         return cls._open(path, lock_store(path) if path.exists() else None)
 
     @classmethod
-    def _take_in(cls, copy: ScratchCopy) -> RunStore:
+    def _open_scratch_copy(cls, copy: ScratchCopy) -> RunStore:
         """Open a store for writing on a local disk."""
         lock = lock_both(copy)
         try:
-            copy.take_in()
+            copy.fetch_store()
         except BaseException:
             lock.close()
             raise
@@ -272,14 +272,14 @@ class RunStore:
         """Check the file's length: SQLite reads a last page that is cut short as zeros."""
         pages, size = (self._rows(f"PRAGMA {name}")[0][name] for name in ("page_count", "page_size"))
         if not has_log(self.path) and self.path.stat().st_size < pages * size:  # in this order: a log may just go
-            raise StoreError(f"{self.path}: the file is cut short; {find_remedy(self.path, 'malformed')}")
+            raise StoreError(f"{self.path}: the file is truncated; {find_remedy(self.path, 'malformed')}")
 
     def _require_readable(self) -> None:
         application, version = (self._rows(f"PRAGMA {name}")[0][name] for name in ("application_id", "user_version"))
         if application != APPLICATION_ID:
             raise StoreError(
-                f"{self.path} is no run store of wiw: expected application id {APPLICATION_ID:#x}, got "
-                f"{application:#x}. If its creation was cut off, begin the run again; else name another folder"
+                f"{self.path} is not a run store of wiw: expected application id {APPLICATION_ID:#x}, got "
+                f"{application:#x}. If its creation was interrupted, start the run again; otherwise give another folder"
             )
         if not OLDEST_READABLE <= version <= SCHEMA_VERSION:
             raise StoreError(
@@ -324,7 +324,7 @@ class RunStore:
     @property
     def wiw_version(self) -> str:
         """Version of wiw that began the run."""
-        return str(self._value("wiw_version"))
+        return str(self._read_column("wiw_version"))
 
     @property
     def benchmark(self) -> int:
@@ -334,21 +334,21 @@ class RunStore:
     @property
     def created(self) -> str:
         """When the run began, ISO 8601 in UTC."""
-        return str(self._value("created"))
+        return str(self._read_column("created"))
 
     @property
     def config(self) -> dict[str, Any]:
         """Task, arms and seed."""
-        return dict(parse_column("config", self._value("config"), str(self.path)))
+        return dict(parse_column("config", self._read_column("config"), str(self.path)))
 
     @property
     def info(self) -> dict[str, Any]:
         """Platform, how to rebuild task and agents, which episodes keep pictures."""
-        return dict(parse_column("info", self._value("info"), str(self.path)))
+        return dict(parse_column("info", self._read_column("info"), str(self.path)))
 
     @property
     def salt(self) -> str:
-        """The salt of keys and seeds (`wiw.loop.keys`); empty for a run that was begun without one."""
+        """The salt of keys and seeds (`wiw.loop.keys`); empty for a run that was started without one."""
         return str(self.info.get("salt", ""))
 
     @property
@@ -459,7 +459,7 @@ class RunStore:
     def count_answers(self) -> dict[str, dict[str, int]]:
         """Return by arm how many answers of a language model ended episodes have, by their problem's kind.
 
-        The kind is empty where an answer could be used. An arm that asked nothing is left out.
+        The kind is empty if an answer could be used. An arm that asked nothing is left out.
         """
         found: dict[str, dict[str, int]] = {}
         problem = "json_extract(e.value, '$.problem')"
@@ -479,7 +479,7 @@ class RunStore:
         return found
 
     def images(self, arm: str, episode: int, decision: int) -> dict[str, bytes]:
-        """Return JPEG by name, empty where no pictures were kept."""
+        """Return JPEG by name, empty if no pictures were kept."""
         rows = self._rows(
             "SELECT name, jpeg FROM image WHERE arm = ? AND episode = ? AND decision = ? ORDER BY name",
             (arm, episode, decision),
@@ -564,11 +564,12 @@ class RunStore:
         """Store a judge's description, so that its marks can be written."""
         with self._writing() as connection:
             connection.execute(
-                "INSERT OR IGNORE INTO judge VALUES (?, ?, ?)", (judge.digest, to_json(dict(judge.description)), _now())
+                "INSERT OR IGNORE INTO judge VALUES (?, ?, ?)",
+                (judge.digest, to_json(dict(judge.description)), _format_now()),
             )
 
     def write_judged(self, row: JudgedRow) -> None:
-        """Write what a judge's marks make of an outcome; marks that are there already stay, an error is replaced."""
+        """Write what a judge's marks make of an outcome; marks that exist already stay, an error is replaced."""
         values = {name: getattr(row, name) for name in ("judge", "arm", "episode", "status", "error", "kind")}
         values |= {name: to_json(dict(getattr(row, name))) for name in OUTCOME_JSON}
         names = ", ".join(values)
@@ -584,7 +585,7 @@ class RunStore:
         """Store the description of an arm's agent as `info["built"][arm]`.
 
         Raises:
-            StoreError: the arm was begun with an agent that said otherwise, such as one of other weights.
+            StoreError: the arm was started with an agent that said otherwise, such as one of other weights.
         """
         info = self.info
         agent = json.loads(to_json(row.agent))
@@ -604,7 +605,7 @@ class RunStore:
             info: what it says of all arms: "agents", "sources" and "departures".
         """
         known = {arm["name"] for arm in self.config["arms"]}
-        added = {"time": _now(), "arms": [arm["name"] for arm in config["arms"] if arm["name"] not in known]}
+        added = {"time": _format_now(), "arms": [arm["name"] for arm in config["arms"] if arm["name"] not in known]}
         log = [*self.info.get("arms_added", []), added]
         with self._writing() as connection:
             connection.execute(
@@ -617,14 +618,14 @@ class RunStore:
         info = self.info
         old = info.get("sources", {})
         changed = sorted(path for path in old.keys() | sources.keys() if old.get(path) != sources.get(path))
-        log = [*info.get("sources_changed", []), {"time": _now(), "files": changed}]
+        log = [*info.get("sources_changed", []), {"time": _format_now(), "files": changed}]
         with self._writing() as connection:
             connection.execute(
                 "UPDATE run SET info = ?", (to_json({**info, "sources": dict(sources), "sources_changed": log}),)
             )
 
     def change_settings(self, changes: Mapping[str, Any]) -> None:
-        """Store settings that the run goes on with; `info["resumed_with"]` lists what was changed, and when."""
+        """Store settings that the run continues with; `info["resumed_with"]` lists what was changed, and when."""
         info = self.info
         own = {**info["limits"], "live": info["live"]}
         changed = {name: value for name, value in changes.items() if name not in own or own[name] != value}
@@ -632,7 +633,7 @@ class RunStore:
             return
         info["live"] = changed.get("live", info["live"])
         info["limits"] |= {name: value for name, value in changed.items() if name != "live"}
-        info["resumed_with"] = [*info.get("resumed_with", []), {"time": _now(), **changed}]
+        info["resumed_with"] = [*info.get("resumed_with", []), {"time": _format_now(), **changed}]
         with self._writing() as connection:
             connection.execute("UPDATE run SET info = ?", (to_json(info),))
 
@@ -644,7 +645,7 @@ class RunStore:
 
     def begin_session(self) -> None:
         """Store when and where episodes begin to be run, and how many have ended before, for `wiw status`."""
-        session = {"begun": _now(), "ended": self.count_ended()[0], **describe_process()}
+        session = {"begun": _format_now(), "ended": self.count_ended()[0], **describe_process()}
         with self._writing() as connection:
             connection.execute("UPDATE run SET info = ?", (to_json({**self.info, "session": session}),))
         if self._copy is not None:
@@ -797,7 +798,7 @@ class RunStore:
         names = ", ".join(f"{name} {row[name]}" for name in ("arm", "episode", "decision") if name in row)
         return f"{self.path}: {table} ({names})"
 
-    def _value(self, column: str) -> Any:
+    def _read_column(self, column: str) -> Any:
         rows = self._rows("SELECT * FROM run")
         if not rows:
             raise StoreError(f"{self.path} is damaged: it does not say which run it holds")
@@ -806,7 +807,7 @@ class RunStore:
 
 @contextmanager
 def leave_resumable(begun: RunStore) -> Iterator[None]:
-    """Where an error ends the work on a new run, note on it how the run goes on, or remove one without any record.
+    """Where an error ends the work on a new run, note on it how the run continues, or remove one without any record.
 
     So a wrong token or missing weights leave no run behind that can neither be begun again nor resumed. An
     interruption leaves it.
@@ -823,12 +824,12 @@ def leave_resumable(begun: RunStore) -> Iterator[None]:
             if counted["n"] == 0:
                 remove_store(path)
             elif store.info["task"] is not None:  # else it was begun with objects, and no command can resume it
-                note = f"What was recorded is kept. Once the cause is mended:  wiw resume {path.parent}"
+                note = f"Everything recorded is kept. Once the cause is fixed:  wiw resume {path.parent}"
                 vars(error).setdefault("__notes__", []).append(note)  # as `add_note` of Python 3.11 does
         raise
 
 
-def _now() -> str:
+def _format_now() -> str:
     """Return the time, ISO 8601 in UTC."""
     return datetime.now(timezone.utc).isoformat(timespec="seconds")
 

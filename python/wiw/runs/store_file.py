@@ -55,8 +55,8 @@ def make_folder(path: Path) -> None:
         path.parent.mkdir(parents=True, exist_ok=True)
     except OSError as error:
         raise StoreError(
-            f"cannot make the run's folder {path.parent} ({error.strerror}); expected free space and the right to "
-            "write there: make room, or choose another with out= or --out"
+            f"cannot create the run's folder {path.parent} ({error.strerror}); expected a writable place with free "
+            "space: make room, or choose another with out= or --out"
         ) from error
 
 
@@ -126,21 +126,22 @@ def lock_store(path: Path) -> Any:
     if kind := find_network(path):
         raise StoreError(
             f"{path.parent} is on a network file system ({kind}), on which SQLite's log is not safe; expected a local "
-            "disk: give a folder on this machine's own disk, as in --scratch /tmp (scratch=), and the store is written "
-            "there and copied here; or a local folder with --out (out=), and then `wiw merge` it to here"
+            "disk: give a folder on this machine's own disk, as in --scratch /tmp (scratch=), so that the store is "
+            "written there and copied here; or give a local folder with --out (out=), and `wiw merge` it to here "
+            "afterwards"
         )
     try:
         handle = path.with_suffix(".lock").open("w")
     except OSError as error:
         raise StoreError(
-            f"cannot write in the run's folder {path.parent} ({error.strerror}); expected free space and the right to "
-            "write there: make room, or choose another with out= or --out"
+            f"cannot write to the run's folder {path.parent} ({error.strerror}); expected a writable folder with free "
+            "space: make room, or choose another with out= or --out"
         ) from error
     try:
         fcntl.flock(handle, fcntl.LOCK_EX | fcntl.LOCK_NB)
     except OSError:
         handle.close()
-        raise StoreError(f"{path} is being written by another process; wait for it to end or stop it") from None
+        raise StoreError(f"{path} is being written by another process; wait for it to end, or stop it") from None
     return handle
 
 

@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Submit commands as jobs of a cluster, through submitit: one array, each element a command a person can run by hand.
+"""Submit commands as cluster jobs through submitit: one array, each element a command that can be run by hand.
 
-A job is this module's `JobCommand`, which starts the command as a process of its own. Before the time limit, and when
+A job is this module's `JobCommand`, which starts the command as a separate process. Before the time limit, and when
 it is preempted with a warning, SLURM sends SIGUSR2: the command stops, everything recorded, and submitit requeues the
 job. At SIGTERM the command stops likewise; `--requeue` lets SLURM itself start the job again where it was preempted,
 and not where it was cancelled.
@@ -32,45 +32,45 @@ from wiw.json_text import parse_json
 SIGNAL_DELAY = 90
 """Seconds before the time limit at which SLURM sends SIGUSR2."""
 PATIENCE = 45.0
-"""Seconds that a command has for stopping; `wiw run` takes 5 at most, `wiw serve` 30 unless it is told otherwise."""
+"""Seconds that a command has for stopping; `wiw run` takes 5 at most, `wiw serve` 30 by default."""
 FILE_NAME = "jobs.json"
 LOGS = "jobs"
-"""Folder in that of the run with submitit's files and the output of jobs."""
+"""Subfolder of the run's folder with submitit's files and the output of jobs."""
 ACTIVE = frozenset(
     (
         *("PENDING", "CONFIGURING", "RUNNING", "SUSPENDED", "REQUEUED", "RESIZING", "COMPLETING", "READY"),
         "UNKNOWN",
     )
 )
-"""States of jobs that wait or run, or may: of a new job `sacct` knows nothing for some seconds."""
+"""States of jobs that are or may be waiting or running: `sacct` does not know a new job for some seconds."""
 FINISHED = (0, 1)
-"""Exit codes of a command that is not to be run again: done, or done with an invalid run."""
+"""Exit codes of a command that must not be run again: done, or done with an invalid run."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class ClusterConfig:
-    """Requests of jobs to the cluster. Memory, accounts and so on are the cluster's own defaults if not given.
+    """Resources that jobs request from the cluster. Anything not given is left to the cluster's defaults.
 
     Raises:
         ArgumentError: a number out of range.
     """
 
     cluster: Literal["slurm", "local"] = "slurm"
-    """slurm, or local: processes of this machine, all at once, to try a submission."""
+    """slurm, or local (processes on this machine, all at once, to try a submission)."""
     partition: Annotated[str | None, arg(metavar="NAME")] = None
     """SLURM partition."""
     minutes: Annotated[float, arg(metavar="N")] = 240
-    """Time limit of a job; one that reaches it is requeued and goes on."""
+    """Time limit of a job in minutes; a job that reaches it is requeued and continues."""
     requeues: Annotated[int, arg(metavar="N")] = 50
-    """How often a job may reach its time limit."""
+    """How often a job may be requeued."""
     gpus: Annotated[int, arg(metavar="N")] = 0
-    """GPUs of a job."""
+    """GPUs per job."""
     cpus: Annotated[int | None, arg(metavar="N")] = None
-    """Cores of a job."""
+    """Cores per job."""
     memory: Annotated[float | None, arg(metavar="GB")] = None
-    """Memory of a job in gigabytes."""
+    """Memory per job in gigabytes."""
     parallel: Annotated[int, arg(metavar="N")] = 256
-    """Most jobs of the array that run at a time."""
+    """Maximum number of jobs of the array that run at the same time."""
     account: Annotated[str | None, arg(metavar="NAME")] = None
     """SLURM account."""
     qos: Annotated[str | None, arg(metavar="NAME")] = None
@@ -109,28 +109,28 @@ class ClusterConfig:
 
 
 class JobCommand:
-    """A command of wiw as a job: runs it, stops it when it is told to, and starts it again when it is requeued."""
+    """A wiw command as a job: runs it, stops it when told to, and restarts it when requeued."""
 
     def __init__(self, arguments: Sequence[str]) -> None:
         self.arguments = list(arguments)
         self._process: subprocess.Popen[bytes] | None = None
 
     def __call__(self) -> int:
-        """Run the command to its end, and return its exit code.
+        """Run the command to completion and return its exit code.
 
         Raises:
             InfrastructureError: it ended with another exit code than `FINISHED`.
         """
         process = self._process = subprocess.Popen([sys.executable, "-m", "wiw.cli", *self.arguments])
-        signal.signal(signal.SIGTERM, self._pass_on)
+        signal.signal(signal.SIGTERM, self._forward_signal)
         while (code := process.poll()) is None:  # wait() holds a lock that `checkpoint` would wait for
             time.sleep(0.1)
         if code not in FINISHED:
-            raise InfrastructureError(f"exit code {code} of: {self}; its output says why. Submit it again to go on")
+            raise InfrastructureError(f"exit code {code} of: {self}; its output says why. Submit it again to continue")
         return code
 
     def checkpoint(self) -> Any:
-        """Stop the command and return it, to be run again; submitit calls this at SIGUSR2."""
+        """Stop the command and return it for requeueing; submitit calls this on SIGUSR2."""
         from submitit.helpers import DelayedSubmission
 
         process = self._process
@@ -146,14 +146,14 @@ class JobCommand:
     def __str__(self) -> str:
         return shlex.join(["wiw", *self.arguments])
 
-    def _pass_on(self, number: int, frame: FrameType | None) -> None:
+    def _forward_signal(self, number: int, frame: FrameType | None) -> None:
         if self._process is not None:
             with suppress(ProcessLookupError):
                 os.kill(self._process.pid, number)
 
 
 def _wait_for_end(process: int) -> None:
-    """Wait until a child has ended, and kill it if it takes too long; somebody else takes its exit code."""
+    """Wait until a child has ended, and kill it if it takes too long; its exit code is read elsewhere."""
     deadline = time.monotonic() + PATIENCE
     with suppress(ChildProcessError):  # its exit code was taken already
         while os.waitid(os.P_PID, process, os.WEXITED | os.WNOWAIT | os.WNOHANG) is None:
@@ -171,7 +171,7 @@ class SubmittedJob:
     arguments: tuple[str, ...]
     """Arguments of `wiw`."""
     state: str = ""
-    """As the cluster says; empty where it was not asked."""
+    """State reported by the cluster; empty if it was not queried."""
 
 
 def submit_commands(
@@ -181,7 +181,7 @@ def submit_commands(
     name: str = "wiw",
     after: Sequence[SubmittedJob] = (),
 ) -> list[SubmittedJob]:
-    """Submit commands of wiw as one array of jobs, and note them in the run's folder.
+    """Submit wiw commands as one array of jobs, and record them in the run's folder.
 
     Args:
         run: its folder, which all machines of the cluster see.
@@ -205,8 +205,8 @@ def submit_commands(
             made = [executor.submit(JobCommand(arguments)) for arguments in commands]
     except (RuntimeError, OSError, submitit.core.utils.FailedSubmissionError) as error:
         raise InfrastructureError(
-            f"the jobs cannot be submitted: {error}; expected a machine from which sbatch works, or try the commands "
-            "on this one with --cluster local"
+            f"the jobs cannot be submitted: {error}; expected a machine on which sbatch works. To try the commands on "
+            "this machine, give --cluster local"
         ) from error
     jobs = [
         SubmittedJob(config.cluster, str(job.job_id), tuple(arguments))
@@ -217,7 +217,7 @@ def submit_commands(
 
 
 def read_jobs(run: str | Path) -> list[SubmittedJob]:
-    """Return the jobs that were submitted for a run, oldest first; none where none were.
+    """Return the jobs submitted for a run, oldest first, possibly none.
 
     Raises:
         StoreError: the list of jobs is damaged.
@@ -228,11 +228,11 @@ def read_jobs(run: str | Path) -> list[SubmittedJob]:
     try:
         return [SubmittedJob(each["cluster"], each["id"], tuple(each["arguments"])) for each in _parse(path)]
     except (ValueError, KeyError, TypeError) as error:
-        raise StoreError(f"{path} is damaged ({error}); remove it, and ask the cluster for its jobs") from error
+        raise StoreError(f"{path} is damaged ({error}); remove it, and check the cluster for its jobs") from error
 
 
 def find_states(run: str | Path) -> list[SubmittedJob]:
-    """Return the jobs of a run with their states, as the cluster says.
+    """Return the jobs of a run with their states, as reported by the cluster.
 
     Raises:
         StoreError: the list of jobs is damaged.
@@ -242,7 +242,7 @@ def find_states(run: str | Path) -> list[SubmittedJob]:
 
 
 def find_active(run: str | Path) -> list[SubmittedJob]:
-    """Return the jobs of a run that wait or run, as the cluster says, and those of which it says nothing.
+    """Return the jobs of a run that are waiting or running according to the cluster, and those it does not know.
 
     Raises:
         StoreError: the list of jobs is damaged.
@@ -251,7 +251,7 @@ def find_active(run: str | Path) -> list[SubmittedJob]:
 
 
 def cancel(run: str | Path) -> list[SubmittedJob]:
-    """Cancel all jobs of a run that have not ended; what was recorded is kept. Return those that were told to end.
+    """Cancel all unfinished jobs of a run and return them; everything recorded is kept.
 
     Raises:
         StoreError: no jobs were submitted for it, or the list of them is damaged.
@@ -269,7 +269,7 @@ def cancel(run: str | Path) -> list[SubmittedJob]:
         except (OSError, subprocess.CalledProcessError) as error:
             raise InfrastructureError(
                 f"scancel {' '.join(arrays)}: {getattr(error, 'stderr', '') or error}; expected a machine of the "
-                "cluster that the jobs were submitted from"
+                "cluster from which the jobs were submitted"
             ) from error
     return told + [job for job in jobs if job.cluster == "slurm"]
 
@@ -302,7 +302,7 @@ def _find_state(folder: Path, job: SubmittedJob) -> str:
 
 
 def _end_controller(process: str) -> bool:
-    """Tell the process that watches a local job to end it; return whether it was there."""
+    """Tell the process that watches a local job to end it; return whether it was found."""
     if not _is_controller(process):
         return False
     with suppress(ProcessLookupError):
@@ -311,7 +311,7 @@ def _end_controller(process: str) -> bool:
 
 
 def _is_controller(process: str) -> bool:
-    """Return whether a process is one that watches a local job: numbers are used again."""
+    """Return whether a process is one that watches a local job, as process ids are reused."""
     try:
         return b"submitit.local._local" in Path("/proc", process, "cmdline").read_bytes()
     except OSError:

@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
 """Rerun some episodes of a run and compare every decision and measurement with the record.
 
-Recorded answers of a language model are replayed. Timings are left out, and so is a rollout cache, which would
-answer with what is to be checked, and LPIPS, whose last digits depend on threads and device.
+Recorded answers of a language model are replayed. Timings are not compared, nor is LPIPS, whose last digits depend on
+threads and device; the rollout cache is not used, as it would return what is to be checked.
 """
 
 from __future__ import annotations
@@ -28,15 +28,15 @@ UNLIKE = ("seconds", "calls", "spent", "arm", "episode", "decision")
 
 @dataclass(frozen=True)
 class Check:
-    """One episode of one arm, recorded and run again."""
+    """One episode of one arm, recorded and rerun."""
 
     arm: str
     episode: int
     recorded: str
-    """SHA-256 of everything that was decided and measured, as hexadecimal digits."""
+    """SHA-256 of everything that was decided and measured, in hexadecimal."""
     again: str
     difference: str
-    """What differs first, e.g. "decision 3: scores: recorded [0.25,0.5], now [0.25,0.75]"; empty where nothing does."""
+    """What differs first, e.g. "decision 3: scores: recorded [0.25,0.5], now [0.25,0.75]"; empty if nothing does."""
 
     @property
     def same(self) -> bool:
@@ -53,7 +53,7 @@ class Verification:
 
     @property
     def same(self) -> bool:
-        """Whether every episode came out as recorded."""
+        """Whether every episode is as recorded."""
         return all(check.same for check in self.checks)
 
     def __str__(self) -> str:
@@ -63,7 +63,9 @@ class Verification:
             for check in self.checks
         ]
         wrong = sum(not check.same for check in self.checks)
-        verdict = "all as recorded" if not wrong else f"{wrong} of {len(self.checks)} differ from what was recorded"
+        verdict = (
+            "everything is as recorded" if not wrong else f"{wrong} of {len(self.checks)} differ from what was recorded"
+        )
         return "\n".join([*lines, f"{self.run}: {verdict}"])
 
 
@@ -72,18 +74,18 @@ Facts = list[tuple[str, dict[str, Any]]]
 
 
 def verify(run: str | Path, episodes: int = 3, seed: int = 0) -> Verification:
-    """Run `episodes` random episodes of a run again, in every arm that has ended them, and compare.
+    """Rerun `episodes` random episodes of a run, in every arm that has finished them, and compare.
 
     Args:
         run: the run's folder.
         episodes: how many; all if the run has fewer.
-        seed: of the choice of episodes.
+        seed: seed of the sample of episodes.
 
     Raises:
         ArgumentError: fewer than one episode.
-        StoreError: no readable run, one of another version of the benchmark, one that was begun with objects in memory,
-            whose task or source files have changed, or without an ended episode.
-        FileError: a scene is not there.
+        StoreError: the run cannot be read, is of another version of the benchmark, was started with objects in memory,
+            has no finished episode, or its task or source files have changed.
+        FileError: a scene does not exist.
     """
     if episodes < 1:
         raise ArgumentError(f"verify: expected episodes of at least 1, got {episodes}")
@@ -91,7 +93,7 @@ def verify(run: str | Path, episodes: int = 3, seed: int = 0) -> Verification:
         store.require_benchmark()
         ended = {(row["arm"], row["episode"]): row for row in store.recorded_outcomes() if row["status"] == "done"}
         if not ended:
-            raise StoreError(f"{store.path} has no ended episode that could be run again; see `wiw resume`")
+            raise StoreError(f"{store.path} has no finished episode to rerun; see `wiw resume`")
         known = sorted({index for _, index in ended})
         chosen = sorted(random.Random(seed).sample(known, min(episodes, len(known))))
         again = _run_again(store, {key for key in ended if key[1] in chosen})
@@ -118,12 +120,12 @@ def _run_again(store: RunStore, keys: set[tuple[str, int]]) -> dict[tuple[str, i
         if indices:
             collected = _Collected()
             runner.run(Job(arm, tuple((index, all_episodes[index]) for index in indices)), collected)
-            found |= {(arm, index): collected.facts(index) for index in indices}
+            found |= {(arm, index): collected.list_facts(index) for index in indices}
     return found
 
 
 class _Collected:
-    """Collects rows in memory, in place of a run store."""
+    """Collects rows in memory instead of a run store."""
 
     def __init__(self) -> None:
         self._agent: Facts = []
@@ -146,7 +148,7 @@ class _Collected:
                 _describe_outcome(row.result.status, row.result.metrics, row.result.error)
             )
 
-    def facts(self, index: int) -> Facts:
+    def list_facts(self, index: int) -> Facts:
         return [*self._agent, *self._get_facts(index)]
 
     def _get_facts(self, index: int) -> Facts:
@@ -154,7 +156,7 @@ class _Collected:
 
 
 def read_facts(store: RunStore, outcome: Mapping[str, Any]) -> Facts:
-    """Return what was decided and measured in an ended episode, given its row of `recorded_outcomes`."""
+    """Return what was decided and measured in a finished episode, given its row of `recorded_outcomes`."""
     arm, index = outcome["arm"], outcome["episode"]
     decisions = [
         _describe_decision(row["decision"], row, store.images(arm, index, row["decision"]))
@@ -186,7 +188,7 @@ def _check(key: tuple[str, int], recorded: Facts, again: Facts) -> Check:
 
 
 def list_differences(recorded: Sequence[tuple[str, Any]], again: Sequence[tuple[str, Any]]) -> Iterator[str]:
-    """Return in words what differs between two records of an episode, first things first."""
+    """Yield in words what differs between two records of an episode, in order."""
     for (place, was), (place_now, now) in zip(recorded, again, strict=False):
         if place != place_now:
             yield f"{place}: now {place_now}, {now.get('error') or 'another number of decisions'}"

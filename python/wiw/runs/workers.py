@@ -23,8 +23,8 @@ from typing import Any, Protocol
 from wiw._core import core
 from wiw.errors import Error, InfrastructureError
 from wiw.isolation.source import end_idle_processes
-from wiw.loop.limits import Limits
 from wiw.runs.compose import RunContext
+from wiw.runs.limits import Limits
 from wiw.runs.rows import AgentRow, DecisionRow, LostRow, OutcomeRow, RestartRow, decision_row
 from wiw.runs.sources import require_unchanged
 from wiw.types import DecisionRecord, Episode, EpisodeResult
@@ -35,7 +35,7 @@ Row = RestartRow | AgentRow | DecisionRow | LostRow | OutcomeRow
 _RESEED = 0x52455345
 """Keeps the seeds of arms that repeat another apart from all other draws."""
 TRIES = 2
-"""Times that an episode is begun whose worker dies."""
+"""How often an episode is started if its worker dies."""
 NUMBERS = {2: "twice", 3: "three times"}
 
 
@@ -274,7 +274,7 @@ def lease_again(
         job: that the worker had.
         unfinished: its episodes that have not ended, by index.
         receiver: discards what it was told of them, and records errors.
-        tries: how often an episode is begun.
+        tries: how often an episode is started.
         cause: why the worker was lost.
     """
     receiver.discard(job.arm, list(unfinished))
@@ -291,7 +291,7 @@ def _describe_exit(exit_code: int) -> str:
     if exit_code >= 0:
         return f"exit code {exit_code}"
     name = signal.Signals(-exit_code).name
-    return f"{name}, perhaps for lack of memory" if name == "SIGKILL" else name
+    return f"{name}, perhaps out of memory" if name == "SIGKILL" else name
 
 
 def _start(spec: bytes, workers: int) -> _Worker:
@@ -357,7 +357,7 @@ def unpickle_spec(data: bytes) -> WorkerSpec:
         return pickle.loads(data)  # noqa: S301 - made by the parent process
     except Exception as error:
         raise InfrastructureError(
-            f"task or agent cannot be built again in a worker process ({error}); define its class in a file and give "
+            f"task or agent cannot be rebuilt in a worker process ({error}); define its class in a file and give "
             "path.py:Class or package.module:Class, or use workers=1"
         ) from error
 

@@ -57,16 +57,16 @@ def import_scan(file: Path, allow_missing: bool, **options: Any) -> tuple[_core.
         return import_mesh(file, **options)
     needed = False
 
-    def note_need(data: bytes) -> NDArray[np.uint8]:
+    def record_need(data: bytes) -> NDArray[np.uint8]:
         nonlocal needed
         needed = True
         raise ValueError("the decoder is not installed")
 
-    imported = _import_with(note_need, file, options)
+    imported = _import_with(record_need, file, options)
     if needed:
         raise DependencyError(
-            f"{file}: its textures are in Basis Universal, which needs opengl_basisu: pip install 'wiw[hm3d]' (or "
-            "--allow-missing-textures draws the scan grey)"
+            f"{file}: its textures are in Basis Universal, which needs opengl_basisu: pip install 'wiw[hm3d]' (or give "
+            "--allow-missing-textures to draw the scan grey)"
         )
     return imported
 

@@ -16,8 +16,8 @@ from wiw.process_limits import end_with_parent, limit_memory, limit_time
 def answer_job(read: Callable[[dict[str, Any]], dict[str, Any]]) -> None:
     """Read the job, limit this process, write what `read` makes of the job.
 
-    What goes wrong with the file becomes part of the reply: an error of wiw's as it is, anything else that a reader
-    raises as a FileError that names the file.
+    Problems with the file become part of the reply: an error of wiw's as it is, anything else that a reader raises as a
+    FileError that names the file.
     """
     with os.fdopen(os.dup(1), "w") as reply:
         os.dup2(2, 1)  # what a library prints is no part of the reply

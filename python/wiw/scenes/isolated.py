@@ -2,8 +2,8 @@
 """Read untrusted files in a child process.
 
 Readers of 3D formats are large programs that trust their input: a damaged file can make one crash, hang or eat all
-memory. In a child process each of these becomes a FileError, and a run of many scenes goes on. The child ends with its
-parent, and has limits of time and memory of its own.
+memory. In a child process each of these becomes a FileError, and a run of many scenes continues. The child ends with
+its parent, and has its own limits of time and memory.
 """
 
 from __future__ import annotations
@@ -44,7 +44,7 @@ def read_in_child(module: str, job: dict[str, Any]) -> dict[str, Any]:
 
     Raises:
         FileError: the file is damaged, also where that ends the child: a crash, a time-out, no memory left.
-        ArgumentError: what the file asks for cannot be.
+        ArgumentError: an option of the job is not valid.
         InfrastructureError: the child could not do its work, whatever the file.
     """
     path = job["path"]
@@ -60,9 +60,9 @@ def read_in_child(module: str, job: dict[str, Any]) -> dict[str, Any]:
             env=make_child_environment(),
         )
     except subprocess.TimeoutExpired:
-        raise _out_of_time(path) from None
+        raise _build_timeout_error(path) from None
     if child.returncode in (-signal.SIGALRM, -signal.SIGXCPU):
-        raise _out_of_time(path)
+        raise _build_timeout_error(path)
     if child.returncode < 0:
         name = signal.Signals(-child.returncode).name
         raise FileError(
@@ -86,5 +86,5 @@ def _reply(path: str, child: subprocess.CompletedProcess[bytes]) -> dict[str, An
     return reply
 
 
-def _out_of_time(path: str) -> FileError:
-    return FileError(f"{path}: importing took more than {TIMEOUT:.0f} s and was given up (damaged file?)")
+def _build_timeout_error(path: str) -> FileError:
+    return FileError(f"{path}: importing took more than {TIMEOUT:.0f} s and was aborted (damaged file?)")

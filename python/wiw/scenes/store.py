@@ -64,7 +64,7 @@ def load_imported(source: Path, options: dict[str, Any], build: Callable[[Path],
         folder().mkdir(parents=True, exist_ok=True)
         draft.touch()
     except OSError as error:
-        _log.warning("an imported scene is not kept and will be imported again the next time: %s", error)
+        _log.warning("an imported scene cannot be cached and will be imported again next time: %s", error)
         return temporary(build)
     started = time.time_ns()
     try:
@@ -92,8 +92,8 @@ def temporary(build: Callable[[Path], Any]) -> _core.scene.Scene:
 def load_generated(identity: Iterable[str | int], make: Callable[[], _core.scene.Scene]) -> _core.scene.Scene:
     """Return a scene that depends on `identity` (generator, version, seed, ...) alone: mapped, or generated.
 
-    Processes that ask for the same scene at the same time make it once. Where it cannot be kept, for want of room or
-    of permission, a warning says so and the scene is in memory only.
+    Processes that request the same scene at the same time build it once. Where it cannot be stored, for lack of space
+    or permission, a warning says so and the scene is in memory only.
     """
     path = folder() / f"{_key(list(identity))}.wiwscene"
     with _turn(path):
@@ -108,7 +108,7 @@ def build_digest() -> str:
 
 
 def limit() -> float:
-    """Return the most bytes that scenes may take on disk.
+    """Return the maximum number of bytes that scenes may take on disk.
 
     Raises:
         ArgumentError: `$WIW_CACHE_GB` is not a number of gigabytes.
@@ -130,13 +130,13 @@ def _keep_scene(scene: _core.scene.Scene, path: Path) -> _core.scene.Scene:
         _trim(path)
         return _core.scene.map_cache(path)
     except (FileError, OSError) as error:
-        _log.warning("a generated scene is not kept and will be made again the next time: %s", error)
+        _log.warning("a generated scene cannot be cached and will be generated again next time: %s", error)
         return scene
 
 
 @contextmanager
 def _turn(path: Path) -> Iterator[None]:
-    """Let one process or thread at a time make what belongs at `path`; where nothing can be locked, all at once."""
+    """Let one process or thread at a time create `path`; where nothing can be locked, all at once."""
     name = path.with_suffix(".lock")
     lock = _open_lock(name)
     try:
@@ -163,13 +163,13 @@ def _open_lock(name: Path) -> IO[str] | None:
 
 
 def _map_scene(path: Path) -> _core.scene.Scene | None:
-    """Map the scene kept at `path` and mark it as used; None where there is none or, with a warning, a damaged one."""
+    """Map the scene kept at `path` and mark it as used; None if there is none or, with a warning, a damaged one."""
     if not path.exists():
         return None
     try:
         scene = _core.scene.map_cache(path)
     except FileError as error:
-        _log.warning("built again: %s", error)
+        _log.warning("rebuilt: %s", error)
         return None
     with suppress(OSError):
         os.utime(path)
@@ -237,7 +237,7 @@ def _find_known(manifest: Path) -> _core.scene.Scene | None:
     except FileNotFoundError:
         return None
     except (OSError, ValueError, KeyError, TypeError) as error:
-        _log.warning("the scene cache is built again: %s", error)
+        _log.warning("the scene cache is rebuilt: %s", error)
         return None
 
 

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Scorers of images: built in, by a network, or any command in a process of its own."""
+"""Scorers of images: built in, by a network, or any command in a separate process."""
 
 from wiw.scorers.laion import LaionScorer
 from wiw.scorers.make import make_scorer

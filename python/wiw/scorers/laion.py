@@ -2,7 +2,7 @@
 """LAION's improved aesthetic predictor: a small network on the image embeddings of CLIP ViT-L/14.
 
 Source: github.com/christophschuhmann/improved-aesthetic-predictor (Apache-2.0), on openai/clip-vit-large-patch14 (MIT).
-Neither is downloaded by this package: the head lies where the user put it, and CLIP there too or in the hub's cache.
+Neither is downloaded by this package: the head is where the user put it, and CLIP there too or in the hub's cache.
 """
 
 from __future__ import annotations
@@ -42,10 +42,10 @@ class LaionScorer:
     Args:
         folder: holds the head's file, and CLIP in a folder of its own; "auto" is the folder of all weights,
             `~/.cache/wiw/weights`.
-        device: of torch; "auto" is the GPU where there is one.
+        device: of torch; "auto" is the GPU if there is one.
 
     Raises:
-        WeightsError: weights are not there (says where they come from) or belong to another network.
+        WeightsError: weights do not exist (says where to get them) or belong to another network.
         DependencyError: torch or transformers is not installed.
     """
 
@@ -103,9 +103,9 @@ class LaionScorer:
 def _require_head(path: Path) -> Path:
     if not path.is_file():
         raise WeightsError(
-            f"LAION's aesthetic predictor: no {HEAD} in {path.parent}. It is a published file of 3.7 MB:\n"
-            f"  curl -L --create-dirs -o '{path}' '{HEAD_URL}'\n"
-            f"CLIP ViT-L/14 comes from the folder {path.parent / CLIP}, or from openai/{CLIP} on the Hugging Face hub"
+            f"LAION's aesthetic predictor: no {HEAD} in {path.parent}. Download the published file (3.7 MB) with:\n  "
+            f"curl -L --create-dirs -o '{path}' '{HEAD_URL}'\nCLIP ViT-L/14 comes from the folder "
+            f"{path.parent / CLIP}, or from openai/{CLIP} on the Hugging Face hub"
         )
     return path
 

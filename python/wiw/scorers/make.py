@@ -20,7 +20,7 @@ def make_scorer(spec: str, deadline: float = DEADLINE) -> Scorer:
 
     Raises:
         ArgumentError: nothing is named, or a deadline out of range.
-        WeightsError: weights of LAION's predictor are not there.
+        WeightsError: weights of LAION's predictor are missing.
         ScorerError: the command cannot be run, or does not say who it is.
     """
     name, _, folder = spec.strip().partition(":")

@@ -1,17 +1,17 @@
 # SPDX-License-Identifier: Apache-2.0
-"""A scorer in a process of its own: any command, in any language, under any licence.
+"""A scorer in a separate process: any command, in any language, under any licence.
 
 The command is started once, without a shell. Its first line on the standard output says who it is:
 
     {"scorer": "my-musiq", "version": "1.0", "licence": "CC-BY-4.0", "scores": {"musiq": [0, 100]}}
 
-Then it reads paths of PNG files from the standard input, one a line, to the end, and answers each by a line, in any
+Then it reads paths of PNG files from the standard input, one per line, to the end, and answers each by a line, in any
 order:
 
     {"path": "/tmp/.../5f3a.png", "scores": {"musiq": 61.5}}
 
-Every line is flushed. What is not an answer belongs on the standard error. It ends with exit code 0 once all paths are
-answered. Nothing of it is imported here, so its licence is its own.
+Every line is flushed. All other output belongs on standard error. It ends with exit code 0 once all paths are answered.
+Nothing of it is imported here, so its licence is its own.
 """
 
 from __future__ import annotations
@@ -44,7 +44,7 @@ QUOTED = 300
 MOST_WAITING = 1024
 """Lines that are read ahead."""
 GRACE = 2.0
-"""Seconds that a scorer has to end by itself when it is closed."""
+"""Seconds that a scorer has to exit on its own once it is closed."""
 
 
 class ProcessScorer:
@@ -132,7 +132,7 @@ class ProcessScorer:
         if not isinstance(path, str) or not isinstance(scores, dict):
             self._fail("malformed", f"{expected}, got {_quote(line)}")
         if path not in asked:
-            self._fail("unknown", f"it scored {_quote(path)}, which it was not asked about; repeat paths as given")
+            self._fail("unknown", f"it scored {_quote(path)}, which was not requested; repeat paths exactly as given")
         if path in answered:
             self._fail("repeated", f"it scored {path} twice; answer each path once")
         if set(scores) != set(self.card.scores):
@@ -162,8 +162,8 @@ class ProcessScorer:
         except queue.Empty:
             self._fail(
                 "hung",
-                f"no line for {self._deadline:g} s, with {answered} of {asked} images answered; flush "
-                "each line, or allow more seconds with deadline= or --deadline",
+                f"no line for {self._deadline:g} s, with {answered} of {asked} images answered; flush each line, or "
+                "allow more time with deadline= or --deadline",
             )
         if not raw:
             self._explain_end(answered, asked)
@@ -176,8 +176,8 @@ class ProcessScorer:
         if not isinstance(line, dict):
             self._fail(
                 "malformed",
-                f"{expected}, got {_quote(raw.decode(errors='replace').strip())}; anything else "
-                "belongs on the standard error",
+                f"{expected}, got {_quote(raw.decode(errors='replace').strip())}; print anything else to standard "
+                "error",
             )
         return line
 
@@ -186,12 +186,12 @@ class ProcessScorer:
         try:
             code = self._process.wait(self._deadline)
         except subprocess.TimeoutExpired:
-            self._fail("hung", f"it closed its output with {answered} of {asked} images answered, and does not end")
+            self._fail("hung", f"it closed its output with {answered} of {asked} images answered, but keeps running")
         if code != 0:
             how = f"by signal {-code}" if code < 0 else f"with exit code {code}"
             self._fail("crashed", f"it ended {how} with {answered} of {asked} images answered")
         if asked == 0:
-            self._fail("card", "it ended without saying who it is; see `wiw quality --help`")
+            self._fail("card", "it ended without identifying itself; see `wiw quality --help`")
         self._fail("partial", f"it ended with {answered} of {asked} images answered; expected an answer for each path")
 
     def _wait(self) -> None:
@@ -201,9 +201,9 @@ class ProcessScorer:
             extra = self._lines.get(timeout=self._deadline)
             code = self._process.wait(self._deadline)
         except (queue.Empty, subprocess.TimeoutExpired):
-            self._fail("hung", f"{count}, but it does not end when its input does")
+            self._fail("hung", f"{count}, but it keeps running after the end of its input")
         if extra:
-            self._fail("repeated", f"{count}, but it goes on with {_quote(extra.decode(errors='replace').strip())}")
+            self._fail("repeated", f"{count}, but it continues with {_quote(extra.decode(errors='replace').strip())}")
         if code != 0:
             self._fail("crashed", f"{count}, but it ended with exit code {code}")
 

@@ -11,7 +11,7 @@ from pathlib import Path
 from typing import Any, Protocol
 
 Range = tuple[float, float] | None
-"""Smallest and largest score, or None where a score has no bounds."""
+"""Smallest and largest score, or None if a score has no bounds."""
 
 
 @dataclass(frozen=True)
@@ -21,7 +21,7 @@ class ScorerCard:
     scorer: str
     """Its id, such as "musiq-koniq"."""
     version: str
-    """Whatever tells its scores from those of another version of it: a release, a digest of weights."""
+    """Whatever identifies its version: a release, a digest of weights."""
     licence: str
     """SPDX id or name of the licence that it is used under."""
     scores: Mapping[str, Range]

@@ -45,6 +45,6 @@ def serve_in_background(model: Any, **settings: Any) -> Iterator[Server]:
     try:
         yield server
     finally:
-        with suppress(RuntimeError):  # it has ended by itself
+        with suppress(RuntimeError):  # it has already ended
             loop.call_soon_threadsafe(server.end)
         thread.join(server.settings.grace + 10)

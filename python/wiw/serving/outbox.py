@@ -10,11 +10,11 @@ from collections.abc import Callable
 from typing import Any
 
 UNSENT_BYTES = 256 * 2**20
-"""Most bytes of a client's messages that wait; an answer beyond that is not queued, and the client must ask again."""
+"""Maximum size in bytes of a client's waiting messages; one beyond that is not queued, and must be requested again."""
 
 
 class Outbox:
-    """Sends a client's messages one after another: each is handed over after the one before has been sent.
+    """Sends a client's messages one after another: each is handed over once the one before has been sent.
 
     Args:
         client: a `websockets` connection.
@@ -30,7 +30,7 @@ class Outbox:
         self._sent, self._sent_before, self._buffered_before = 0, 0, 0
         self._progress_at = time.monotonic()
         self.unsent_bytes = 0
-        """Bytes of messages that have not left, the one that is being sent included."""
+        """Bytes of messages that have not been sent yet, including the current one."""
 
     def __len__(self) -> int:
         """Return how many messages have not left."""
@@ -78,7 +78,7 @@ class Outbox:
             self._room.set()  # whoever waits finds that the connection has ended
 
     def stalled_seconds(self) -> float:
-        """Return for how long messages have waited of which not a byte has left; to be called regularly."""
+        """Return how long messages have waited without a byte being sent; to be called regularly."""
         buffered = self._client.transport.get_write_buffer_size()  # grows by pings
         if not self._messages or self._sent != self._sent_before or buffered < self._buffered_before:
             self._progress_at = time.monotonic()

@@ -94,7 +94,7 @@ class Queue:
             self._changed.notify()
 
     def share(self, client: Hashable) -> None:
-        """Note that a client asks for a row that another one has already asked for."""
+        """Note that a client requests a row that another one has already requested."""
         with self._changed:
             self._unanswered[client] += 1
 
@@ -127,7 +127,7 @@ class Queue:
                 self._changed.wait(wait if batch else None)
 
     def end(self) -> None:
-        """End the queue: nothing more will come."""
+        """End the queue: the queue is closed."""
         with self._changed:
             self._ending = True
             self._changed.notify()

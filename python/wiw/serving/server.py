@@ -1,12 +1,11 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The server: connections on one side, a queue of rows on the other, the model in a thread of its own."""
+"""The server: connections on one side, a queue of rows on the other, the model in its own thread."""
 
 from __future__ import annotations
 
 import asyncio
 import contextlib
 import hmac
-import ipaddress
 import json
 import logging
 import ssl
@@ -30,6 +29,7 @@ from wiw.serving.answer_cache import AnswerCache
 from wiw.serving.outbox import Outbox
 from wiw.serving.queue import Job, Queue
 from wiw.serving.worker import Outcome, Worker
+from wiw.wire.loopback import is_loopback
 from wiw.wire.messages import Answer, Ask, Hello, Message, Refusal, Wait, Welcome, decode, encode
 from wiw.wire.rows import row_id, unpack_row
 from wiw.world_models.base import WorldModel
@@ -38,15 +38,15 @@ from wiw.world_models.remote.limits import check_row, most_bytes
 
 PORT = 8765
 CLIENTS = 256
-"""Most connections at a time."""
+"""Maximum number of connections at a time."""
 KNOWN_BYTES = 512 * 2**20
-"""Most bytes of answers that are kept for clients that ask again."""
+"""Maximum size in bytes of answers kept for clients that ask again."""
 AHEAD = 4
 """Full batches that one client may have unanswered, so that rows travel while others are computed."""
 HEARTBEAT, SILENCE, HANDSHAKE = 10.0, 30.0, 10.0
 """Seconds: between pings, without an answer to one until a client counts as gone, and for a client's first message."""
 UNREAD = 30.0
-"""Seconds in which a client takes nothing of what waits for it, until it is sent away."""
+"""Seconds after which a client that receives nothing is disconnected."""
 CLOSING = 1.0
 """Seconds that a client has to end the connection in order."""
 TICK = 0.1
@@ -92,11 +92,11 @@ class Settings:
             )
         if not self.token and not is_loopback(self.host):
             raise ArgumentError(
-                f"serve: {self.host} can be reached by others than this machine: set WIW_TOKEN (or --token) to a "
-                "secret that clients show, such as the output of `openssl rand -hex 16`"
+                f"serve: {self.host} can be reached from other machines: set WIW_TOKEN (or --token) to a secret that "
+                "clients send, such as the output of `openssl rand -hex 16`"
             )
         if self.key is not None and self.certificate is None:
-            raise ArgumentError("serve: a key without a certificate: name that, too, or nothing would be encrypted")
+            raise ArgumentError("serve: got a key without a certificate: give both, or nothing would be encrypted")
 
     @property
     def tls(self) -> ssl.SSLContext | None:
@@ -130,8 +130,8 @@ class Server:
             raise ArgumentError(f"serve: expected a world model, got {model!r}; see `wiw list`")
         if "simulator" in model.accepts.needs:
             raise ArgumentError(
-                f"serve: {type(model).__name__} needs the simulator, which cannot leave the process it runs in; "
-                "name it where the run is: wiw run --world-model oracle"
+                f"serve: {type(model).__name__} needs the simulator, which cannot leave the run's process; use it in "
+                "the run itself: wiw run --world-model oracle"
             )
         self.model, self.settings = model, settings or Settings()
         self.address = ""
@@ -168,7 +168,7 @@ class Server:
         return sum(outbox.unsent_bytes for outbox in self._outboxes.values())
 
     async def run(self, ready: Callable[[], None] = lambda: None) -> None:
-        """Serve until `end` is called; then finish what it has taken.
+        """Serve until `end` is called; then finish the rows it has accepted.
 
         Raises:
             InfrastructureError: the address cannot be listened at.
@@ -178,8 +178,8 @@ class Server:
             listener = await self._listen()
         except OSError as error:
             raise InfrastructureError(
-                f"cannot listen at {self.settings.host} port {self.settings.port}: {error.strerror or error}; name "
-                "another one (--port 0 takes any that is free)"
+                f"cannot listen at {self.settings.host} port {self.settings.port}: {error.strerror or error}; choose "
+                "another port (--port 0 takes a free one)"
             ) from None
         async with listener:
             port = next(iter(listener.sockets)).getsockname()[1]
@@ -221,7 +221,7 @@ class Server:
     def _admit(self, connection: ServerConnection, request: Request) -> Response | None:
         """Return the refusal of a client; None lets it in."""
         if len(self._unanswered) >= CLIENTS:
-            return connection.respond(HTTPStatus.SERVICE_UNAVAILABLE, f"{CLIENTS} clients are connected already\n")
+            return connection.respond(HTTPStatus.SERVICE_UNAVAILABLE, f"{CLIENTS} clients are already connected\n")
         token = self.settings.token
         shown = request.headers.get_all("Authorization")
         if token and not (len(shown) == 1 and hmac.compare_digest(shown[0].encode(), f"Bearer {token}".encode())):
@@ -284,7 +284,7 @@ class Server:
     def _explain_refusal(self, client: ServerConnection) -> str:
         """Return why no row of this client is accepted now; empty if one is."""
         if self._ending.is_set():
-            return "the server is ending"
+            return "the server is shutting down"
         return "too many rows unanswered" if self._unanswered[client] >= self._welcome.in_flight else ""
 
     def _estimate_wait(self) -> float:
@@ -308,7 +308,7 @@ class Server:
                 return False
             self._jobs[ask.id] = job
         elif client in job.askers:
-            raise RemoteError("a row was asked for twice on one connection", "message")
+            raise RemoteError("a row was requested twice on one connection", "message")
         else:
             self.queue.share(client)
             job.expires = max(job.expires, now + ask.seconds)
@@ -340,7 +340,7 @@ class Server:
             self.queue.count_answer(client)
             outbox, message = self._outboxes[client], answer
             if not outbox.takes(len(answer)):
-                message = encode(Wait(job.id, self._estimate_wait(), "earlier answers wait to be read"))
+                message = encode(Wait(job.id, self._estimate_wait(), "earlier answers have not been read yet"))
             outbox.put(message, partial(self._release_slot, client))
 
     def _release_slot(self, client: ServerConnection) -> None:
@@ -364,7 +364,7 @@ class Server:
                     self._start_task(self._disconnect_client(client, outbox))
             for job in self.queue.take_expired():
                 self._send_answer(
-                    job, encode(Refusal(job.id, "deadline", "the row was not begun in time: the queue is long"))
+                    job, encode(Refusal(job.id, "deadline", "the row was not started in time: the queue is long"))
                 )
 
     async def _finish_rows(self) -> None:
@@ -380,14 +380,6 @@ def _welcome(model: WorldModel, in_flight: int) -> Welcome:
 
 
 def _sources(model: WorldModel, fingerprint: str) -> dict[str, Any]:
-    """Return what tells versions of a model apart that declares none: digests of its source files, by name."""
+    """Return an identifier of the version of a model that declares none: digests of its source files, by name."""
     digests = {} if fingerprint else source_digests(model)
     return {"sources": {Path(path).name: digest for path, digest in digests.items()}} if digests else {}
-
-
-def is_loopback(host: str) -> bool:
-    """Return whether an address to listen on is of this machine alone."""
-    try:
-        return ipaddress.ip_address(host).is_loopback
-    except ValueError:
-        return host == "localhost"

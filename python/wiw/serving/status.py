@@ -32,7 +32,7 @@ class Status:
         ]
         parts += [self._rate()] if self.changed else [self._rates] if self._rates else []
         if (since := worker.busy_since) is not None and time.monotonic() - since > 10:
-            parts.append(f"at work on a batch for {time.monotonic() - since:.0f} s")
+            parts.append(f"working on a batch for {time.monotonic() - since:.0f} s")
         if server.refused:
             parts.append(f"{server.refused} refused")
         return ", ".join(parts)

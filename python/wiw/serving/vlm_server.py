@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """A small OpenAI-compatible server of chat completions, with any `Client` behind it.
 
-It speaks log-probabilities, images as data URIs, JSON schemas, choices and usage, as far as `wiw` and its tests ask for
+It speaks log-probabilities, images as data URIs, JSON schemas, choices and usage, as far as `wiw` and its tests use
 them.
 """
 
@@ -17,15 +17,15 @@ from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
 from typing import Any
 
 from wiw.errors import ArgumentError, Error
-from wiw.serving.server import is_loopback
 from wiw.vlm.base import Client
 from wiw.vlm.images import from_data_uri
 from wiw.vlm.messages import Call, Completion, Message, Part
+from wiw.wire.loopback import is_loopback
 
 MOST_BYTES = 256 << 20
-"""Most bytes of a request's body."""
+"""Maximum size of a request's body in bytes."""
 UNCLEAR = (Error, ValueError, LookupError, TypeError, AttributeError, OverflowError, RecursionError)
-"""What a request that makes no sense raises; anything else is a fault of the model or script behind the server."""
+"""Error for a request that makes no sense; anything else is a fault of the model or script behind the server."""
 
 
 @dataclass(frozen=True)
@@ -53,8 +53,8 @@ class VlmServer:
     def __init__(self, client: Client, port: int = 0, host: str = "127.0.0.1", token: str | None = None) -> None:
         if token is None and not is_loopback(host):
             raise ArgumentError(
-                f"serve-vlm: {host} can be reached by others than this machine: set WIW_TOKEN (or --token) to a secret "
-                "that clients send as OPENAI_API_KEY, such as the output of `openssl rand -hex 16`"
+                f"serve-vlm: {host} can be reached from other machines: set WIW_TOKEN (or --token) to a secret that "
+                "clients send as OPENAI_API_KEY, such as the output of `openssl rand -hex 16`"
             )
         self.client, self.token = client, token
         self.requests: list[dict[str, Any]] = []
@@ -102,8 +102,8 @@ class VlmServer:
         return Response(200, make_chat_completion(self.complete(body), self.client.model, number))
 
     def complete(self, body: dict[str, Any]) -> Completion:
-        """Return the completion that a request asks for."""
-        call = call_of(body)
+        """Return the completion of a request."""
+        call = parse_call(body)
         with self._asking:
             (completion,) = self.client.complete([call])
         return completion
@@ -144,7 +144,7 @@ class _Handler(BaseHTTPRequestHandler):
         server: VlmServer = self.server.server  # type: ignore[attr-defined]
         if self.headers.get("origin"):  # a browser names the page that asks; no page has business here
             self.close_connection = True
-            self._send(403, _error("web pages are not answered"))
+            self._send(403, _error("requests from web pages are refused"))
             return
         if not self._is_welcome(server.token):
             return
@@ -171,7 +171,7 @@ class _Handler(BaseHTTPRequestHandler):
         if token is None or hmac.compare_digest(shown, f"Bearer {token}".encode()):
             return True
         self.close_connection = True
-        self._send(401, _error("the server's token is expected as API key"))
+        self._send(401, _error("expected the server's token as API key"))
         return False
 
     def _send(self, status: int, body: Mapping[str, Any], headers: Mapping[str, str] | None = None) -> None:
@@ -188,11 +188,11 @@ class _Handler(BaseHTTPRequestHandler):
             self.close_connection = True
 
 
-def call_of(body: Mapping[str, Any]) -> Call:
-    """Return the call that a request asks for.
+def parse_call(body: Mapping[str, Any]) -> Call:
+    """Return the call of a request.
 
     Raises:
-        ArgumentError: an image that is no data URI, or several completions at once.
+        ArgumentError: an image that is not a data URI, or several completions at once.
         KeyError: no messages.
     """
     if int(body.get("n") or 1) != 1 or body.get("stream"):

@@ -48,8 +48,8 @@ class Worker(threading.Thread):
     def _answers(self, rows: Sequence[Row]) -> list[Outcome]:
         """Return what the model gives for each row.
 
-        Where it raises, each half of the batch is asked again: a row that it cannot do fails alone, and too many rows
-        for the memory become fewer.
+        Where it raises, each half of the batch is computed again: a row that it cannot do fails alone, and too many
+        rows for the memory become fewer.
         """
         try:
             frames = check_rollout(self._model, *stack(rows))

@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """Rerun the failures of a run with ground truth in one stage at a time, and in several.
 
-Episodes, keys, agents and limits are the run's own, so that a rerun differs by its ground truth and nothing else.
+Episodes, keys, agents and limits are the run's own, so that a rerun differs only by its ground truth.
 """
 
 from __future__ import annotations
@@ -45,31 +45,31 @@ def blame(
         found["warp"].verdicts      # {"imagination": 3, "scoring": 12, "proposals": 7, "joint": 1, "beyond": 0}
 
     Each failure is rerun with the oracle world model, with ground-truth scores, with a ground-truth plan among the
-    proposals, and with all three (`wiw.experiments.ground_truth`). For question answering by policy `explorer`, the
-    stages after imagination are others: true labels and colours of real views, a tour of the whole home, and both
-    (`wiw.experiments.privileged_explorers`). Reruns are stored in the folder `blame` of the run; a second call
-    continues where the first one stopped, and runs nothing twice.
+    proposals, and with all three (`wiw.experiments.ground_truth`). For question answering with policy `explorer`, the
+    stages after imagination are different: true labels and colours for real views, a tour of the whole home, and both
+    (`wiw.experiments.privileged_explorers`). Reruns are stored in the run's folder `blame`; a second call continues
+    where the first one stopped, and runs nothing twice.
 
     Args:
         run: the run's folder.
         arms: one, several, or None for all.
-        episodes: largest number of failures per arm, drawn at random; a larger number contains a smaller one's. None
-            means all.
-        workers: processes; None means as many as the run was begun with. Results do not depend on it.
+        episodes: maximum number of failures per arm, sampled at random; a larger number includes the failures of a
+            smaller one. None means all.
+        workers: number of processes; None means as many as the run was started with. Results do not depend on it.
         progress: whether to show bars.
         retry_errors: whether to repeat reruns that ended with an infrastructure error.
-        reviser_options: options of the policy that revises in place of the run's, for what lies elsewhere now: a
+        reviser_options: options that override those of the run's revision policy, for things that have moved: a
             server's address, a folder of weights. Whatever would change results is refused.
-        tracker: likewise, the tracker by name.
-        tracker_options: likewise.
+        tracker: overrides the tracker by name, under the same conditions.
+        tracker_options: override the tracker's options, under the same conditions.
 
     Raises:
-        ArgumentError: an unknown arm, no failure, a number out of range, a task that does not say what success
-            or progress is, or an agent that cannot use the ground truth, such as one without a reviser, or one that
-            answers questions with another policy than `explorer`; or other options where nothing is left to rerun.
-        StoreError: no readable run, one that was begun with objects in memory or by another version, or whose task,
+        ArgumentError: an unknown arm, no failure, a number out of range, a task that does not say what success or
+            progress is, or an agent that cannot use the ground truth, such as one without a reviser, or one that
+            answers questions with another policy than `explorer`; or overrides if nothing is left to rerun.
+        StoreError: the run cannot be read, was started with objects in memory or by another version, or its task,
             agents or navigation meshes have changed.
-        FileError: a scene is not there.
+        FileError: a scene does not exist.
     """
     for name, value in (("episodes", episodes), ("workers", workers)):
         if value is not None and value < 1:
@@ -83,8 +83,8 @@ def blame(
         if (reviser_options or tracker or tracker_options) and not any(pending.values()):
             store.close()
             raise ArgumentError(
-                f"blame: {base.path.parent} has nothing left to rerun, so other options of the reviser or the tracker "
-                "change nothing; leave them out to see the verdicts, or repeat reruns that ended with an error "
+                f"blame: {base.path.parent} has nothing left to rerun, so overriding options of the reviser or the "
+                "tracker has no effect; leave them out to see the verdicts, or repeat reruns that ended with an error "
                 "(--retry-errors)"
             )
         relocated = {
@@ -98,7 +98,7 @@ def blame(
 
 
 def _choose_failures(base: RunStore, arms: str | Sequence[str] | None, most: int | None) -> dict[str, set[int]]:
-    """Return the failures to be rerun, by arm."""
+    """Return the failures to rerun, by arm."""
     known = [one["name"] for one in base.config["arms"]]
     names = known if arms is None else [arms] if isinstance(arms, str) else list(arms)
     if unknown := [name for name in names if name not in known]:
@@ -132,9 +132,9 @@ def _explain_refusal(base: RunStore, scheme: Scheme, arm: str, agents: Mapping[s
     stages = ", ".join(list(scheme.reruns)[:-1])
     allowed = ",".join(name for name, agent in agents.items() if scheme.allows(agent))
     todo = (
-        f"choose from the arms that have it: --arm {allowed}"
+        f"choose from the arms with that policy: --arm {allowed}"
         if allowed
-        else f"`wiw run {base.config['task'].get('task')} --policy {scheme.policy}` makes a run with such arms"
+        else f"`wiw run {base.config['task'].get('task')} --policy {scheme.policy}` starts a run with such arms"
     )
     return (
         f"arm '{arm}' answers questions with {own}; only policy '{scheme.policy}' has stages that can be rerun with "
@@ -152,7 +152,7 @@ def _make_recipes(base: RunStore, wanted: Mapping[str, set[int]]) -> tuple[Any, 
     Raises:
         ArgumentError: the task does not say what progress is.
         StoreError: see `blame`.
-        FileError: a scene is not there.
+        FileError: a scene does not exist.
     """
     base.require_version()
     task, agents = read_recipes(base)
@@ -161,8 +161,8 @@ def _make_recipes(base: RunStore, wanted: Mapping[str, set[int]]) -> tuple[Any, 
     base.require_task(built.describe())
     if scheme.needs_guide and not built.has_guide:
         raise ArgumentError(
-            f"blame: task '{base.config['task'].get('task')}' does not define the true value of a plan; derive it "
-            "from wiw.tasks.navigation.NavigationTask, or write `guide` of its environment and set `has_guide`"
+            f"blame: task '{base.config['task'].get('task')}' does not define the true value of a plan; derive it from "
+            "wiw.tasks.navigation.NavigationTask, or implement `guide` in its environment and set `has_guide`"
         )
     require_scenes(built, base, [episodes[index] for found in wanted.values() for index in found])
     return task, {
@@ -185,7 +185,7 @@ def _with_ground_truth(recipe: AgentRecipe, stages: tuple[str, ...]) -> AgentRec
 def _replace_options(
     recipe: AgentRecipe, reviser_options: Mapping[str, Any], tracker: str | None, tracker_options: Mapping[str, Any]
 ) -> AgentRecipe:
-    """Return the agent with other options; that it is the same agent is checked once it is built."""
+    """Return the agent with overridden options; whether it is still the same agent is checked once it is built."""
     name = recipe.policy if recipe.reviser is None else recipe.reviser
     policy_options = {**recipe.policy_options, name: {**recipe.policy_options.get(name, {}), **reviser_options}}
     return replace(

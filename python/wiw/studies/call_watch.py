@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Watches what a world model does to the arrays that it is handed, and to those that it has answered with."""
+"""Watches what a world model does to the arrays that it is given, and to those that it has answered with."""
 
 from __future__ import annotations
 

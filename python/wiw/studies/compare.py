@@ -31,12 +31,12 @@ from wiw.studies.run_log import RunLog, load_run
 from wiw.types import Episode
 
 LENGTH_TOLERANCE = 1e-3
-"""Metres by which the shortest path of an episode may differ between two machines."""
+"""Metres by which an episode's shortest path may differ between two machines."""
 
 BUDGET_RULES = ("decisions", "actions", "limit", "budget", "execute", "horizon")
-"""Rules of tasks that say how much an episode may take."""
+"""Rules of tasks that define an episode's budget."""
 MOST_NAMED = 5
-"""Differences between two agents that are listed by name."""
+"""Maximum number of differences between two agents that are listed by name."""
 
 
 @dataclass(frozen=True)
@@ -46,7 +46,7 @@ class Comparison(SummaryTable):
     runs: tuple[str, str] = ("", "")
     """Names of the runs in the table."""
     changed: tuple[str, ...] = ()
-    """Differences between the two agents of a row, a sentence each."""
+    """Differences between the two agents of a row, one sentence each."""
 
     def groups(self) -> tuple[Group, ...]:
         """Return all differences as one table."""
@@ -59,7 +59,7 @@ class Comparison(SummaryTable):
         return (Group(title, f"Gain of {second} over {first}", f"{second} minus {first}", rows),)
 
     def remarks(self) -> tuple[str, ...]:
-        """Return what both runs need to be read with, and the differences between the agents."""
+        """Return notes on how to read both runs, and the differences between the agents."""
         return (*super().remarks(), *self.changed)
 
 
@@ -74,22 +74,23 @@ def compare(
 ) -> Comparison:
     """Compare two runs on the same episodes: run b minus run a, for each arm that both have.
 
-        wiw.compare("runs/old", "runs/new")                      # every arm of both, under its name
-        wiw.compare("runs/a", "runs/b", arm="warp")              # one
+        wiw.compare("runs/old", "runs/new")                      # every arm of both runs, under its name
+        wiw.compare("runs/a", "runs/b", arm="warp")              # one arm
         wiw.compare("runs/a", "runs/b", arm="warp", other="mine")  # b's "mine" minus a's "warp"
 
     Args:
-        a: folder of a run, wherever it lies, or the run.
-        b: likewise.
-        arm: of run a (and of run b, unless `other` names another); None: all that both have, or the only one of each.
+        a: a run, or its folder.
+        b: the same for the second run.
+        arm: arm of run a (and of run b, unless `other` is given); None: all arms that both have, or the only one of
+            each.
         other: arm of run b to compare with `arm`.
         judge: name or digest of the judge whose marks are compared (see `wiw.judge`); None for each run's own, or the
             one that a run given as an object was opened with.
-        unlike_budgets: whether to compare runs whose episodes may take unlike numbers of decisions or actions; the
-            table then says what differs.
+        unlike_budgets: whether to compare runs whose episodes have different budgets of decisions or actions; the table
+            then says what differs.
 
     Raises:
-        ArgumentError: an arm that is not there, no arm in common, or a judge that has not marked a run.
+        ArgumentError: an arm that does not exist, no common arm, or a judge that has not marked a run.
         StoreError: a run cannot be read, or the two differ in task, seed, episodes or judge: the first field that
             differs.
     """
@@ -97,7 +98,7 @@ def compare(
     pairs = _list_pairs(first, second, arm, other)
     require_comparable(first, second, pairs, unlike_budgets)
     differing = list_unlike_budgets(first, second, pairs)
-    unlike = [f"UNLIKE BUDGETS: {'; '.join(differing)}."] if differing else []
+    unlike = [f"DIFFERENT BUDGETS: {'; '.join(differing)}."] if differing else []
     names = _name_runs(first, second)
     sides = [
         (log, {pair[side]: f"{pair[side]} · {names[side]}" for pair in pairs})
@@ -139,7 +140,7 @@ def compare(
         names,
         (*unlike, *(line for pair in pairs for line in _describe_changes(first, second, pair))),
         unbalanced=count_unbalanced(second),
-        looks="One of the runs was looked at before it was stopped." if anytime else "",
+        looks="One of the runs was stopped early by a rule." if anytime else "",
     )
 
 
@@ -151,7 +152,7 @@ def _open(run: str | Path | RunLog, judge: str | None) -> RunLog:
 
 
 def _summarise_arms(log: RunLog, both: Summary, labels: Mapping[str, str]) -> list[ArmSummary]:
-    """Return the lines of one run's arms, with the roles that they have in it; `labels` by arm."""
+    """Return the lines of one run's arms, with their roles in it; `labels` by arm."""
     policies = [one["name"] for one in log.store.config["arms"] if one["agent"].get("model") is None]
     return [replace(both[label], role=role_of(arm, policies)) for arm, label in labels.items()]
 
@@ -170,40 +171,42 @@ def require_comparable(
     Args:
         a: run.
         b: another.
-        pairs: arms of both that are compared, whose budgets must be alike.
+        pairs: arms of both to compare, whose budgets must be equal.
         unlike_budgets: whether budgets may differ.
 
     Raises:
-        StoreError: the first field that differs, with both values and what to do; of budgets all that differ.
+        StoreError: the first field that differs, with both values and what to do; for budgets all that differ.
     """
     versions = [a.store.benchmark, b.store.benchmark]
     if versions[0] != versions[1]:
-        advice = "scores of unlike versions differ by the benchmark itself (docs/results.md): run the older one again"
+        advice = (
+            "scores of different versions differ because of the benchmark itself (docs/results.md): rerun the older one"
+        )
         _refuse(a, b, "version of the benchmark", versions, advice)
     ours, theirs = a.store.config, b.store.config
     for name in dict.fromkeys([*ours["task"], *theirs["task"]]):
         values = [_simplify_value(config["task"].get(name)) for config in (ours, theirs)]
         if values[0] != values[1] and name not in ("judge", *BUDGET_RULES):
-            _refuse(a, b, f"task.{name}", values, "run one of them again with the other's task, scenes and preset")
+            _refuse(a, b, f"task.{name}", values, "rerun one of them with the other's task, scenes and preset")
     if not unlike_budgets and (differing := list_unlike_budgets(a, b, pairs)):
         raise StoreError(
-            f"cannot compare {a.path} and {b.path}: their episodes have unlike budgets: {'; '.join(differing)}. A "
-            "larger budget raises success by itself: run one of them again with the other's numbers, or compare them "
-            "nevertheless with --unlike-budgets (unlike_budgets=True), and report both budgets"
+            f"cannot compare {a.path} and {b.path}: their episodes have different budgets: {'; '.join(differing)}. A "
+            "larger budget raises success by itself: rerun one of them with the other's budget, or compare them "
+            "anyway with --unlike-budgets (unlike_budgets=True) and report both budgets"
         )
     _require_same_judge(a, b)
     if ours["seed"] != theirs["seed"]:
-        _refuse(a, b, "seed", [ours["seed"], theirs["seed"]], f"run one of them again with --seed {ours['seed']}")
+        _refuse(a, b, "seed", [ours["seed"], theirs["seed"]], f"rerun one of them with --seed {ours['seed']}")
     episodes = a.store.episodes(), b.store.episodes()
     if len(episodes[0]) != len(episodes[1]):
         counts = [len(one) for one in episodes]
-        _refuse(a, b, "episodes", counts, f"run the shorter one again with --episodes {max(counts)}")
+        _refuse(a, b, "episodes", counts, f"rerun the shorter one with --episodes {max(counts)}")
     for index, pair in enumerate(zip(*episodes, strict=True)):
         _require_same_episode(a, b, index, pair)
 
 
 def list_unlike_budgets(a: RunLog, b: RunLog, pairs: Sequence[tuple[str, str]]) -> list[str]:
-    """Return how the budgets of two runs differ: rules of the task, and actions that arms carry out per decision."""
+    """Return how the budgets of two runs differ: rules of the task, and actions that arms execute per decision."""
     rules = [log.store.config["task"] for log in (a, b)]
     found = [
         f"task.{name} is {to_json(rules[0].get(name))} in the first and {to_json(rules[1].get(name))} in the second"
@@ -213,12 +216,12 @@ def list_unlike_budgets(a: RunLog, b: RunLog, pairs: Sequence[tuple[str, str]]) 
     for pair in pairs:
         executed = [_count_executed(log, arm) for log, arm in zip((a, b), pair, strict=True)]
         if None not in executed and executed[0] != executed[1]:
-            found.append(f"{_label(pair[1], pair[0])} carries out {executed[0]} and {executed[1]} actions per decision")
+            found.append(f"{_label(pair[1], pair[0])} executes {executed[0]} and {executed[1]} actions per decision")
     return found
 
 
 def _count_executed(log: RunLog, arm: str) -> int | None:
-    """Return the most actions that an arm carries out per decision; None for an agent that does not say."""
+    """Return the maximum number of actions that an arm executes per decision; None for an agent that does not say."""
     built = log.store.info.get("built", {}).get(arm, {})
     if not {"horizon", "execute"} <= built.keys():
         return None
@@ -227,16 +230,16 @@ def _count_executed(log: RunLog, arm: str) -> int | None:
 
 
 def _require_same_judge(a: RunLog, b: RunLog) -> None:
-    """Check that the marks of both runs are by one judge, with one model, prompt and sampling."""
+    """Check that the marks of both runs are by the same judge, with the same model, prompt and sampling."""
     judges = [log.store.judge for log in (a, b)]
     digests = [None if judge is None else judge.digest for judge in judges]
     if digests[0] != digests[1]:
         known = [{judge.digest: judge for judge in log.store.judges} for log in (a, b)]
         common = [judge.full_label for digest, judge in known[0].items() if digest in known[1]]
-        judged = f"both have marks by {common[0]}: name that with judge= or --judge" if common else ""
-        remedy = judged or "judge both with the same judge (`wiw judge`), then name it with judge= or --judge"
+        judged = f"both have marks by {common[0]}: choose it with judge= or --judge" if common else ""
+        remedy = judged or "judge both with the same judge (`wiw judge`), then choose it with judge= or --judge"
         labels = ["no judge" if judge is None else judge.full_label for judge in judges]
-        _refuse(a, b, "judge", labels, f"marks of unlike judges are not comparable; {remedy}")
+        _refuse(a, b, "judge", labels, f"marks from different judges are not comparable; {remedy}")
 
 
 def _require_same_episode(a: RunLog, b: RunLog, index: int, pair: tuple[Episode, Episode]) -> None:
@@ -245,9 +248,9 @@ def _require_same_episode(a: RunLog, b: RunLog, index: int, pair: tuple[Episode,
     for name in described[0]:
         values = [_simplify_value(one[name]) for one in described]
         if values[0] != values[1]:
-            _refuse(a, b, f"episode {index}: {name}", values, "they ran on different episodes; run one of them again")
+            _refuse(a, b, f"episode {index}: {name}", values, "they ran on different episodes; rerun one of them")
     if all(map(math.isfinite, lengths)) and abs(lengths[0] - lengths[1]) > LENGTH_TOLERANCE:
-        advice = "the scene itself has changed (its file, or its navigation mesh); run one of them again"
+        advice = "the scene itself has changed (its file or its navigation mesh); rerun one of them"
         _refuse(a, b, f"episode {index}: shortest path", lengths, advice)
 
 
@@ -267,7 +270,9 @@ def _refuse(a: RunLog, b: RunLog, field: str, values: Sequence[Any], advice: str
 
 def _list_pairs(a: RunLog, b: RunLog, arm: str | None, other: str | None) -> list[tuple[str, str]]:
     if other is not None and arm is None:
-        raise ArgumentError(f"compare: other='{other}' names an arm of the second run; arm= must name one of the first")
+        raise ArgumentError(
+            f"compare: other='{other}' names an arm of the second run; also name one of the first with arm="
+        )
     if arm is not None:
         pair = arm, other or arm
         for log, name in ((a, pair[0]), (b, pair[1])):
@@ -280,13 +285,13 @@ def _list_pairs(a: RunLog, b: RunLog, arm: str | None, other: str | None) -> lis
     if len(a.arms) == len(b.arms) == 1:
         return [(a.arms[0], b.arms[0])]
     raise ArgumentError(
-        f"compare: {a.path} has arms {', '.join(a.arms)}, {b.path} has {', '.join(b.arms)}: none in common; "
-        "name one of each (arm= and other=, or --arm and --other)"
+        f"compare: {a.path} has arms {', '.join(a.arms)}, {b.path} has {', '.join(b.arms)}: none in common; name one "
+        "of each (arm= and other=, or --arm and --other)"
     )
 
 
 def _name_runs(a: RunLog, b: RunLog) -> tuple[str, str]:
-    """Return the shortest ends of the two paths that differ."""
+    """Return the shortest differing ends of the two paths."""
     paths = [log.path.resolve().parts for log in (a, b)]
     if paths[0] == paths[1]:
         return "first", "second"
@@ -310,14 +315,14 @@ def _describe_changes(a: RunLog, b: RunLog, pair: tuple[str, str]) -> list[str]:
     differing = [name for name in names if described[0].get(name) != described[1].get(name)]
     label = _label(pair[1], pair[0])
     if not differing:
-        return [f"{label}: same agent in both runs."]
+        return [f"{label}: the same agent in both runs."]
     details = [f"{name} {to_json(described[0].get(name))} -> {to_json(described[1].get(name))}" for name in differing]
     more = f", and {len(details) - MOST_NAMED} more" if len(details) > MOST_NAMED else ""
     return [f"{label}: {', '.join(details[:MOST_NAMED])}{more}."]
 
 
 def _describe_agent(log: RunLog, arm: str, built: bool) -> dict[str, Any]:
-    """Return the agent's description, flattened: as it was built, or else as it was configured."""
+    """Return the agent's flattened description: as built, or else as configured."""
     configured = next(one["agent"] for one in log.store.config["arms"] if one["name"] == arm)
     return {**_flatten(log.store.info["built"][arm] if built else configured), "wiw": log.store.wiw_version}
 

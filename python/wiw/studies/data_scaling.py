@@ -1,9 +1,9 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Does a world model get better with data, or with updates? (paper, "Data scaling".)
+"""Does a world model improve with data, or with updates? (paper, "Data scaling".)
 
 The paper trains on 400 to 80,000 clips for one epoch each, so that more clips are also more updates. Here the sizes are
-trained for one epoch as well, for equally many updates, and on clips of fewer scenes. `data_scaling_plan` has what is
-measured and how it is judged, which is written to the study's folder before anything is trained.
+also trained for one epoch, for equally many updates, and on clips from fewer scenes. `data_scaling_plan` defines what
+is measured and how it is judged, which is written to the study's folder before anything is trained.
 """
 
 from __future__ import annotations
@@ -51,12 +51,12 @@ from wiw.training.learners import make_learner
 from wiw.training.post_training.corpora import NavigationCorpus, require_panoramas
 
 PLAN, DATA = "plan.json", "data"
-"""In a study's folder."""
+"""Names inside a study's folder."""
 MEASURING = 60
-"""Updates that take about as long as measuring a model."""
+"""Number of updates that take about as long as evaluating a model."""
 
 Watch = Callable[[str, int, int, str], None]
-"""Called with what is done, how much of it, out of how much, and a text."""
+"""Called with what is being done, how much is done, out of how much, and a text."""
 
 
 @dataclass(frozen=True)
@@ -69,7 +69,7 @@ class DataScaling:
     """Folder of the study, which `save` writes into."""
 
     def summary(self) -> None:
-        """Print the tables and what they say."""
+        """Print the tables and findings."""
         from wiw.report.data_scaling_tables import print_scaling
 
         print_scaling(self.table)
@@ -96,21 +96,21 @@ def data_scaling(
     episodes: int = 0,
     watch: Watch = lambda *_: None,
 ) -> DataScaling:
-    """Train small world models on nested parts of a dataset, measure them, and split the gain into data and updates.
+    """Train small world models on nested subsets of a dataset, evaluate them, and split the gain into data and updates.
 
         found = wiw.data_scaling("data", "runs/scaling", workers=2)
         found.summary()
         found.save()
 
-    The same call goes on where an earlier one was stopped; a training that was under way resumes from its last state.
+    The same call continues where an earlier one was stopped; an unfinished training resumes from its last checkpoint.
 
     Args:
-        data: folder of `wiw collect navigation`, of panoramas with depth; None collects 16 apartments in 128x256 into
+        data: folder of `wiw collect navigation`, with panoramas and depth; None collects 16 apartments at 128x256 into
             `out`.
         out: folder of the study.
         settings: sizes, models, seeds and what is measured; `wiw.studies.data_scaling_plan.SMALL` is the small version.
-        workers: processes, each with one thread.
-        episodes: of ImageNav in which the models of the first seed are run as well; none if 0.
+        workers: number of processes, each with one thread.
+        episodes: episodes of ImageNav in which to run the first seed's models as well; 0 for none.
         watch: called with progress.
 
     Raises:
@@ -158,7 +158,9 @@ def make_plan(data: Path, settings: ScalingSettings) -> ScalingPlan:
     trained, held_out = (NavigationData(data, part, settings.held_out) for part in ("train", "held-out"))
     require_panoramas("data-scaling", NavigationCorpus(trained, "train"))
     if not trained.meta["config"]["depth"]:
-        raise ArgumentError(f"data-scaling: expected a dataset with depth, got {data}; collect it without --no-depth")
+        raise ArgumentError(
+            f"data-scaling: expected a dataset with depth, got {data}, which has none; collect it without --no-depth"
+        )
     if not len(held_out) or not len(trained):
         raise ArgumentError(
             f"data-scaling: expected scenes to train on and others held out, got {len(trained)} segments to train on "
@@ -168,7 +170,7 @@ def make_plan(data: Path, settings: ScalingSettings) -> ScalingPlan:
     if len(clips) < settings.clips:
         raise ArgumentError(
             f"data-scaling: expected {settings.clips} clips of {settings.length} frames in scenes to train on, got "
-            f"{len(clips)}; collect more scenes, or ask for fewer (--clips {len(clips)})"
+            f"{len(clips)}; collect more scenes, or use fewer clips (--clips {len(clips)})"
         )
     _, windows = np.unique(list_scenes(trained, clips), return_counts=True)
     sizes = choose_sizes(settings.clips, settings.batch, settings.sizes)
@@ -193,8 +195,10 @@ def write_plan(plan: ScalingPlan, folder: Path) -> None:
     except (OSError, ValueError, TypeError) as error:
         raise FileError(f"{path}: expected the plan of a study, got {error}; name another folder with --out") from error
     if differing := [name for name in {**asked, **there} if there.get(name) != asked.get(name)]:
-        said = ", ".join(f"{name} {there.get(name)} there and {asked.get(name)} asked" for name in differing)
-        raise ArgumentError(f"{folder} holds another study: {said}; ask for the same, or name another with --out")
+        said = ", ".join(f"{name} was {there.get(name)}, now {asked.get(name)}" for name in differing)
+        raise ArgumentError(
+            f"{folder} holds a different study: {said}; repeat it with the same settings, or choose another with --out"
+        )
 
 
 def _collect(folder: Path, workers: int, watch: Watch) -> Path:
@@ -233,7 +237,7 @@ def _prepare(plan: ScalingPlan, data: Path, folder: Path, watch: Watch) -> None:
 
 
 def _run_trainings(jobs: Sequence[TrainingJob], workers: int, watch: Watch) -> dict[Training, Measures]:
-    """Run what is not finished, and return the measures of all."""
+    """Run unfinished trainings, and return the measures of all."""
     found = {job.training: measures for job in jobs if (measures := job.read_measures()) is not None}
     costs = {job.training: job.training.updates + MEASURING for job in jobs}
     before, began = sum(costs[training] for training in found), time.monotonic()
@@ -247,7 +251,7 @@ def _run_trainings(jobs: Sequence[TrainingJob], workers: int, watch: Watch) -> d
 
 
 def _group_by_setting(measures: Mapping[Training, Measures]) -> dict[str, list[Measures]]:
-    """Return the measures of each training, those of its seeds in their order."""
+    """Return the measures of each training, in the order of its seeds."""
     found: dict[str, list[Measures]] = {}
     for training in sorted(measures, key=lambda each: each.seed):
         found.setdefault(training.setting, []).append(measures[training])
@@ -257,7 +261,7 @@ def _group_by_setting(measures: Mapping[Training, Measures]) -> dict[str, list[M
 def _run_imagenav(
     jobs: Sequence[TrainingJob], plan: ScalingPlan, folder: Path, episodes: int, workers: int
 ) -> list[Success]:
-    """Run the models of the first seed in closed loop on the same episodes, or go on with that."""
+    """Run the models of the first seed in closed loop on the same episodes, or continue with that."""
     from wiw.loop.agent import Agent
     from wiw.studies.evaluate import evaluate
 

@@ -70,7 +70,7 @@ class ScalingSettings:
             if not few or len(set(few)) < len(few):
                 raise ArgumentError(f"data-scaling: expected different {name}, got {few}")
         if self.sizes < 3:
-            raise ArgumentError(f"data-scaling: expected 3 sizes or more, for a trend, got {self.sizes}")
+            raise ArgumentError(f"data-scaling: expected at least 3 sizes, for a trend, got {self.sizes}")
         if min(self.batch, self.held_out_clips, self.decisions_per_scene) < 1 or min(self.seeds) < 0:
             raise ArgumentError(f"data-scaling: expected numbers of 1 or more and seeds of 0 or more, got {self}")
 

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""One training of a data-scaling study, and what its model is worth: a job for a process of its own."""
+"""One training of a data-scaling study, and what its model is worth: a job for a separate process."""
 
 from __future__ import annotations
 
@@ -100,7 +100,7 @@ class TrainingJob:
         return self.folder / "weights" / f"{self.training.name}.safetensors"
 
     def read_measures(self) -> Measures | None:
-        """Return what was measured; None where it is not finished.
+        """Return what was measured; None if it is not finished.
 
         Raises:
             FileError: the file is damaged.

@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Figures of a machine's GPU: rendering in batches, and rollout and training step of each small network.
+"""Benchmark a machine's GPU: batched rendering, and rollouts and training steps of the small networks.
 
-One call measures all of it, so that figures of different machines compare. On a machine without a GPU the same call
-measures small sizes of what can run, and says what was not run.
+One call measures everything, so that results of different machines are comparable. On a machine without a GPU the same
+call measures small versions of what can run, and says what was skipped.
 """
 
 from __future__ import annotations
@@ -28,17 +28,17 @@ from wiw.files import atomic_file
 from wiw.runs.platform import describe_platform
 
 VIEWS = (1, 16, 64, 256)
-"""Views of a batch, on a GPU."""
+"""Views per batch on a GPU."""
 ROWS = (1, 16, 64)
-"""Rows of a network's batch, on a GPU."""
+"""Rows per network batch on a GPU."""
 FEW_VIEWS, FEW_ROWS = (1, 4), (1, 2)
-"""The same on a machine without one."""
+"""The same on a machine without a GPU."""
 SIZES: dict[str, tuple[int, int]] = {"perspective": (480, 480), "panorama": (576, 1024)}
 """Height and width of views."""
 SHRINK = 4
 """Factor by which views are smaller on a machine without a GPU."""
 SECONDS, LEAST, MOST = 0.5, 3, 50
-"""Time that is spent on each figure, within so many repeats."""
+"""Seconds spent on each measurement, and the minimum and maximum number of repeats."""
 LEARNING_RATE = 1e-5
 Backend = Literal["cpu", "gpu"]
 Progress = Callable[[str], None]
@@ -57,11 +57,11 @@ class Measurement:
     ms: float
     """Time of a batch: the median over the repeats."""
     memory_mb: float | None
-    """Most memory of the device that torch took; None where that is not known."""
+    """Peak device memory used by torch in megabytes; None if unknown."""
 
     @property
     def ms_each(self) -> float:
-        """Milliseconds of one of the batch."""
+        """Milliseconds per item of the batch."""
         return self.ms / self.batch
 
 
@@ -70,20 +70,20 @@ class DeviceBenchmark:
     """The result of `wiw.benchmark_device`."""
 
     devices: dict[str, str]
-    """Names of what was found: "cpu", and "cuda" and "egl" where there are some."""
+    """Names of the devices found: "cpu", and "cuda" and "egl" if available."""
     platform: dict[str, Any]
     rows: list[Measurement]
     not_run: list[str]
-    """Measurements left out, and why."""
+    """Skipped measurements, with the reason."""
     notes: list[str] = field(default_factory=list)
 
     def to_json(self) -> str:
-        """Return all figures as JSON."""
+        """Return all measurements as JSON."""
         rows = [{**asdict(row), "ms_each": row.ms_each} for row in self.rows]
         return json.dumps({**asdict(self), "wiw": wiw.__version__, "rows": rows}, indent=1)
 
     def save(self, path: str | Path) -> Path:
-        """Write the figures as JSON.
+        """Write the measurements as JSON.
 
         Raises:
             FileError: the file cannot be written.
@@ -104,24 +104,25 @@ def benchmark_device(
     seconds: float = SECONDS,
     progress: Progress = lambda _: None,
 ) -> DeviceBenchmark:
-    """Measure rendering in batches, and rollout and training step of each small network, on what this machine has.
+    """Measure batched rendering, and rollouts and training steps of the small networks, on this machine's devices.
 
         found = wiw.benchmark_device()
         found.save("gpu.json")
 
-    With a GPU: by EGL on the first hardware device, and by torch on "cuda". Without: on the CPU, in small sizes.
+    With a GPU: with EGL on the first hardware device, and with torch on "cuda". Without one: on the CPU, in small
+    sizes.
 
     Args:
-        scene: spec of the single scene that is drawn.
+        scene: spec of the single scene to render.
         networks: names, such as "warpnet"; all if None, none if empty.
-        rendering: whether views are drawn.
-        views: views of a batch; 1, 16, 64 and 256 on a GPU, else 1 and 4.
-        rows: rows of a network's batch; 1, 16 and 64 on a GPU, else 1 and 2.
-        seconds: that each figure may take, but for the least number of repeats.
-        progress: called with each thing before it is measured.
+        rendering: whether to measure rendering.
+        views: views per batch; by default 1, 16, 64 and 256 on a GPU, otherwise 1 and 4.
+        rows: rows per network batch; by default 1, 16 and 64 on a GPU, otherwise 1 and 2.
+        seconds: seconds to spend on each measurement, apart from the minimum number of repeats.
+        progress: called with a description before each measurement.
 
     Raises:
-        ArgumentError: a network that is not there, or a number below 1.
+        ArgumentError: an unknown network, or a number below 1.
         FileError: there is no such scene.
     """
     for name, numbers in (("views", views), ("rows", rows)):
@@ -136,8 +137,8 @@ def benchmark_device(
         found += _measure_networks(networks, rows, seconds, devices, not_run, progress)
     peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 2**10
     notes = [
-        f"This process took {peak:.0f} MB of main memory at most; load {os.getloadavg()[0]:.1f} at the end.",
-        "A training step is a pass, the mean square of its outputs, the gradient and AdamW.",
+        f"Peak memory of this process: {peak:.0f} MB; load {os.getloadavg()[0]:.1f} at the end.",
+        "A training step is a forward pass, the mean square of its outputs, the backward pass and AdamW.",
     ]
     return DeviceBenchmark(devices, describe_platform(), found, not_run, notes)
 
@@ -153,7 +154,7 @@ def _measure_rendering(
     not_run: list[str],
     progress: Progress,
 ) -> Iterator[Measurement]:
-    """Draw views by each back end that is there."""
+    """Render views with each available backend."""
     backends = _find_backends(devices, not_run)
     is_fast = "gpu" in backends and "software" not in devices["egl"]
     shrink = 1 if is_fast else SHRINK
@@ -173,25 +174,25 @@ def _measure_rendering(
 
 
 def _find_backends(devices: dict[str, str], not_run: list[str]) -> list[Backend]:
-    """Return the back ends that can draw here, and note the EGL device."""
+    """Return the backends that can render here, and note the EGL device."""
     try:
         usable = [device for device in render.egl_devices() if not device["error"]]
     except BackendError as error:
-        not_run.append(f"rendering by EGL: {error}")
+        not_run.append(f"rendering with EGL: {error}")
         return ["cpu"]
     if not usable:
-        not_run.append("rendering by EGL: no device gives an OpenGL context")
+        not_run.append("rendering with EGL: no device provides an OpenGL context")
         return ["cpu"]
     hardware = [device for device in usable if not device["software"]]
     chosen = (hardware or usable)[0]
     devices["egl"] = f"{chosen['renderer']}, OpenGL {chosen['version']}{'' if hardware else ' (software)'}"
     if not hardware:
-        not_run.append(f"rendering by EGL on a hardware device: there is only {devices['egl']}")
+        not_run.append(f"rendering with EGL on a hardware device: there is only {devices['egl']}")
     return ["cpu", "gpu"]
 
 
 def _prepare_views(place: World, kind: str, size: tuple[int, int], count: int) -> Callable[[], Any]:
-    """Return a call that draws a batch of views with colour, depth and ids, from places all over a scene."""
+    """Return a function that renders a batch of views with colour, depth and ids, from places all over a scene."""
     poses = _choose_poses(place, count)
     renderer = place.renderer
     if kind == "panorama":
@@ -202,7 +203,7 @@ def _prepare_views(place: World, kind: str, size: tuple[int, int], count: int) -
 
 
 def _choose_poses(place: World, count: int) -> NDArray[np.float64]:
-    """Return poses [count, 4, 4] a metre above the middles of the floor's triangles, headed all ways."""
+    """Return poses [count, 4, 4] a metre above the centres of the floor's triangles, with all headings."""
     triangles = place.navmesh.triangles()[0]
     middles = triangles.mean(axis=1)[np.linspace(0, len(triangles) - 1, count).astype(int)]
     poses = np.tile(np.eye(4), (count, 1, 1))
@@ -252,7 +253,7 @@ def _measure_networks(
 
 
 def measure_network(name: str, batch: int, device: str, label: str, seconds: float) -> list[Measurement]:
-    """Return the figures of a network's rollout and of its training step, on a device of torch.
+    """Measure a network's rollout and training step on a torch device.
 
     Args:
         name: of `wiw.studies.network_cases.list_cases`.
@@ -296,7 +297,7 @@ def measure_network(name: str, batch: int, device: str, label: str, seconds: flo
 def _time_on(
     device: str, work: Callable[[], Any], wait: Callable[[], Any], seconds: float
 ) -> tuple[float, float | None]:
-    """Return the milliseconds of a call, and the most memory of the device in megabytes."""
+    """Return the milliseconds of a call, and the peak device memory in megabytes."""
     import torch
 
     if not device.startswith("cuda"):
@@ -308,7 +309,7 @@ def _time_on(
 
 
 def _time(work: Callable[[], Any], wait: Callable[[], Any], seconds: float) -> float:
-    """Return the median milliseconds of a call, after one that is not counted; `wait` until the device has done it."""
+    """Return the median milliseconds of a call, after a warm-up call; `wait` blocks until the device is done."""
     work()
     wait()
     times: list[float] = []

@@ -1,9 +1,9 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Study of which kind of error costs success: true futures are made worse by known doses, and success is measured.
+"""Study which kinds of error cost success: degrade true futures by known doses, and measure success.
 
-The paper finds that success follows controllability rather than visual quality, over a dozen models that differ in
-both and in everything else. Here one thing is changed at a time, in futures that are true otherwise, so that a loss of
-success is due to the error and nothing else (`wiw.experiments.errors`).
+The paper finds that success follows controllability rather than visual quality, over a dozen models that differ in both
+and in everything else. Here one thing is changed at a time in otherwise true futures, so that a loss of success is due
+to that error and nothing else (`wiw.experiments.errors`).
 """
 
 from __future__ import annotations
@@ -17,7 +17,7 @@ from typing import Any
 
 from wiw.analysis.errors import ErrorTable, summarise_errors
 from wiw.errors import ArgumentError, StoreError
-from wiw.experiments.errors import ERRORS
+from wiw.experiments.errors.kinds import ERRORS
 from wiw.loop import keys
 from wiw.metrics import Lpips
 from wiw.registry import task_class
@@ -31,17 +31,17 @@ from wiw.types import PRIMITIVES
 
 TASKS = ("imagenav", "ar", "aeqa", "manipulation")
 FLOOR, CEILING = "none", "oracle"
-"""Arms beside those with errors: no imagination, and true futures."""
+"""Arms in addition to those with errors: no imagination, and true futures."""
 BLOCK = 8
-"""Episodes of one part of a run, in which every arm is run before the next part begins."""
+"""Episodes in one part of a run; every arm finishes a part before the next part begins."""
 
 Watch = Callable[[str, int, int, str], None]
-"""Called with what is done, how much of it, out of how much, and a text."""
+"""Called with what is being done, how much is done, out of how much, and a text."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class ErrorSettings:
-    """Settings that a user of the study chooses.
+    """The user's settings of the study.
 
     Raises:
         ArgumentError: a number out of range, or an unknown task or kind of error.
@@ -49,24 +49,25 @@ class ErrorSettings:
 
     tasks: tuple[str, ...] = TASKS
     kinds: tuple[str, ...] = tuple(ERRORS)
-    """Kinds of errors; those that make no sense in a task are left out there, and named."""
+    """Kinds of errors; those that make no sense in a task are skipped there, and listed."""
     doses: int = 3
-    """Doses of each kind, the largest ones of `FutureError.doses`."""
+    """Number of doses of each kind, counted from the largest of `FutureError.doses`."""
     episodes: int = 100
     """Episodes of each task."""
     seed: int = 0
     scenes: str | None = None
-    """Scenes of tasks in which an agent walks; the task's own if None."""
+    """Scenes of tasks in which an agent walks; None means the task's default."""
     per_scene: int = 2
-    """Episodes in a scene, of tasks in which an agent walks."""
+    """Episodes per scene, for tasks in which an agent walks."""
     preset: str | None = None
-    """Rules of the tasks, by name or by the path of a YAML file (`wiw.tasks.presets`); each task's default if None."""
+    """Preset of the tasks, as a name or the path of a YAML file (`wiw.tasks.presets`); None means each task's
+    default."""
     tier: str | None = None
-    """Tier of Image-Goal Navigation: near, far, beyond, or all; episodes of no tier if None."""
+    """Tier of Image-Goal Navigation: near, far, beyond, or all; None means episodes without a tier."""
     policy: str | None = None
-    """The preset's, or else the task's own, if None."""
+    """Policy; None means the preset's, or else the task's."""
     size: tuple[int, int] | None = None
-    """Height and width of the oracle's frames; its own if None."""
+    """Height and width of the oracle's frames; None means its default."""
     fidelity_share: float = 0.25
     """Share of the decisions at which frames and scores are compared with the true ones."""
 
@@ -92,13 +93,13 @@ class ErrorSettings:
         return self.policy or TaskRecipe(task, {"preset": self.preset}).find_policy()
 
     def list_arms(self, task: str) -> dict[str, tuple[str, float]]:
-        """Return kind and dose of the arms of a task that have an error, by arm."""
+        """Return the kind and dose of each of a task's arms that have an error."""
         space = getattr(task_class(task), "space", PRIMITIVES)
         found = [(kind, dose) for kind in self.kinds for dose in ERRORS[kind].doses.get(space, ())[-self.doses :]]
         return {f"{ERROR}{kind}@{dose:g}": (kind, dose) for kind, dose in found}
 
     def list_left_out(self, task: str) -> list[str]:
-        """Return the kinds that make no sense in a task."""
+        """Return the kinds of error that make no sense in a task."""
         chosen = {kind for kind, _ in self.list_arms(task).values()}
         return [kind for kind in self.kinds if kind not in chosen]
 
@@ -107,7 +108,7 @@ FULL = ErrorSettings()
 SMALL = ErrorSettings(
     tasks=("imagenav",), kinds=("blur", "flicker", "ignored", "moved"), doses=2, episodes=8, size=(144, 256)
 )
-"""About three minutes on two cores."""
+"""A small version that takes about three minutes on two cores."""
 
 
 @dataclass(frozen=True)
@@ -115,13 +116,13 @@ class ErrorStudy:
     """The result of `wiw.study_errors`."""
 
     tables: tuple[ErrorTable, ...]
-    """One a task."""
+    """One table per task."""
     settings: ErrorSettings
     out: Path
     """Folder of the study, which `save` writes into."""
 
     def summary(self) -> None:
-        """Print the tables and what they say."""
+        """Print the tables and findings."""
         from wiw.report.error_tables import print_errors
 
         print_errors(self.tables)
@@ -152,21 +153,21 @@ def study_errors(
         found.summary()
         found.save()
 
-    The same call goes on where an earlier one was stopped, episode by episode; with more kinds, doses or tasks it adds
-    them. Runs are ordinary ones, a part of the episodes each: `wiw merge runs/errors/imagenav` makes one of them, `wiw
-    report` and `wiw view` show it.
+    The same call continues where an earlier one was stopped, episode by episode; with more kinds, doses or tasks it
+    adds them. The runs are ordinary ones, each with a part of the episodes: `wiw merge runs/errors/imagenav` combines
+    them, `wiw report` and `wiw view` show the result.
 
     Args:
         out: folder of the study, with a folder of runs for each task.
         settings: tasks, errors, doses and episodes; `wiw.studies.errors.SMALL` is the small version.
-        workers: processes; results do not depend on it.
+        workers: number of processes; results do not depend on it.
         lpips: folder of the weights of LPIPS, or "auto", to measure it besides PSNR and SSIM.
         watch: called with progress.
 
     Raises:
         ArgumentError: a number out of range, or a policy that does not fit a task.
         StoreError: the folder holds a study with other settings.
-        WeightsError: those of LPIPS are not there.
+        WeightsError: those of LPIPS are missing.
     """
     if lpips is not None:
         Lpips(lpips)  # fails before anything takes time
@@ -184,14 +185,15 @@ def study_errors(
 
 
 def read_errors(out: str | Path, settings: ErrorSettings = FULL) -> ErrorStudy:
-    """Return the study in a folder as far as it has come, running nothing.
+    """Return the study in a folder, as far as it has progressed, without running anything.
 
     Args:
         out: folder of the study.
-        settings: that it was begun with; tasks in which no arm with an error has ended an episode are left out.
+        settings: settings that it was started with; tasks in which no arm with an error has finished an episode are
+            left out.
 
     Raises:
-        StoreError: that is so in all tasks.
+        StoreError: this is so for all tasks.
     """
     folder = Path(out)
     tables = [_read_task(task, settings, _list_parts(folder / task)) for task in settings.tasks]
@@ -205,7 +207,7 @@ def read_errors(out: str | Path, settings: ErrorSettings = FULL) -> ErrorStudy:
 
 
 def _list_parts(folder: Path) -> list[Path]:
-    """Return the folders of a task's runs that are there."""
+    """Return the existing folders of a task's runs."""
     return sorted(path.parent for path in folder.glob("shard-*-of-*/run.sqlite"))
 
 
@@ -250,7 +252,7 @@ def _run_task(
 
 
 def _find_salt(folder: Path) -> str:
-    """Return the salt that the parts of a run have in common: that of the first one, or a new one."""
+    """Return the common salt of a run's parts: that of the first one, or a new one."""
     begun = _list_parts(folder)
     if not begun:
         return keys.draw_salt()
@@ -259,7 +261,7 @@ def _find_salt(folder: Path) -> str:
 
 
 def _order_arms(arms: Mapping[str, tuple[str, float]]) -> list[str]:
-    """Return the arms with the largest dose of each kind first, so that a study that is cut off has all kinds."""
+    """Return the arms with the largest dose of each kind first, so that an interrupted study covers all kinds."""
     doses: dict[str, list[float]] = {}
     for kind, dose in arms.values():
         doses.setdefault(kind, []).append(dose)
@@ -267,7 +269,7 @@ def _order_arms(arms: Mapping[str, tuple[str, float]]) -> list[str]:
 
 
 def make_recipes(task: str, settings: ErrorSettings) -> tuple[TaskRecipe, AgentRecipe]:
-    """Return what the runs of a task are made by: the task, and the agent whose world model is the oracle."""
+    """Return the recipes for a task's runs: the task, and the agent whose world model is the oracle."""
     walks = getattr(task_class(task), "space", PRIMITIVES) == PRIMITIVES
     options: dict[str, Any] = {"seed": settings.seed}
     if walks:
@@ -287,7 +289,7 @@ def _size_option(settings: ErrorSettings) -> dict[str, Any]:
 def _read_task(task: str, settings: ErrorSettings, parts: Sequence[Path]) -> ErrorTable | None:
     """Return the numbers of a task from its runs, which may be unfinished.
 
-    None until an episode is scored in no imagination, in true futures and in an arm with an error.
+    None until an episode has been scored without imagination, with true futures and in an arm with an error.
     """
     with ExitStack() as stack:
         logs = [load_run(path) for path in parts]

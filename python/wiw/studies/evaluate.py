@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Run an agent, or several variants of it, on the same episodes and record everything."""
+"""Run an agent, or several variants of it, on the same episodes, and record everything."""
 
 from __future__ import annotations
 
@@ -14,11 +14,11 @@ from typing import Any
 from wiw.analysis.stopping import StopRule, parse_stop_rule
 from wiw.errors import ArgumentError, Error, StoreError
 from wiw.loop import keys
-from wiw.loop.limits import Limits
 from wiw.metrics import Lpips
 from wiw.runs.config import EngineConfig, ResumeConfig, RunConfig, read_resume_settings, take_settings
 from wiw.runs.departures import describe_departures
 from wiw.runs.execute import read_recipes, require_left, run_pending, sources_of, update_own_sources
+from wiw.runs.limits import Limits
 from wiw.runs.pictures import pool_episodes
 from wiw.runs.platform import describe_platform
 from wiw.runs.recipes import (
@@ -56,25 +56,25 @@ def evaluate(
     Args:
         env_or_task: an environment from `wiw.make`, its task, a `TaskRecipe`, or a task's name.
         agent: a `wiw.Agent` or an `AgentRecipe`.
-        episodes: how many; None means as many as the task says.
+        episodes: number of episodes; None means the task's default.
         arms: world models to run on the same episodes with this agent's policies, by name, class or instance, or
             "policy+model" for one with another built-in policy, such as "heuristic+none"; "placebo-shuffled" and
-            "placebo-swapped" are placebos of the agent's model (else of warp), "placebo-blind" one of a text model,
-            "placebo-shuffled:oracle" of another.
-            "small=warpnet?weights=small.npz" names an arm and gives its model options, as on the command line; a
-            mapping gives the arms names of their own. None means the agent's own model.
-        more_arms: with `resume`, whether to add the arms that the run lacks; all that it has must be unchanged.
-        config: how the run goes.
-        settings: any of `RunConfig`'s in place of the config's, such as seed, out, workers, keep_images, resume,
+            "placebo-swapped" are placebos of the agent's model (or else of warp), "placebo-blind" is one of a text
+            model, "placebo-shuffled:oracle" one of another model. "small=warpnet?weights=small.npz" names an arm and
+            sets options of its model, as on the command line; with a mapping, the keys are the arms' names. None means
+            the agent's own model.
+        more_arms: with `resume`, whether to add arms that the run lacks; the existing ones must be unchanged.
+        config: settings of the run.
+        settings: settings of `RunConfig` that override the config's, such as seed, out, workers, keep_images, resume,
             deadline, cache and fidelity; and options of a task given by name, such as `scenes` and `preset`.
 
     Raises:
-        ArgumentError: options for a task that is already made; a number out of range.
-        StoreError: `out` holds a run and `resume` is off, or a run of another configuration, or of source files that
-            have changed since; or arms are to be added to a run that a rule stops early.
+        ArgumentError: options for a task that already exists; a number out of range.
+        StoreError: `out` holds a run and `resume` is off, or a run with a different configuration or with source files
+            that have changed since; or arms are to be added to a run that a rule stops early.
         ContractError: a policy or a world model broke its contract.
         InfrastructureError: worker processes cannot be started or given their work.
-        WeightsError: those of LPIPS are not there; says which, and how to get them.
+        WeightsError: those of LPIPS are missing; says which, and how to get them.
     """
     own, task_options = take_settings(config, settings, episodes)
     if own.servers and own.served is None:
@@ -98,7 +98,7 @@ def run_arms(
 
 
 def _find_model_name(agent: Any) -> str | None:
-    """Return the name of an agent's world model; None where it has none, or an object."""
+    """Return the name of an agent's world model; None if it has none, or if it is an object."""
     recipe = agent_recipe(agent)
     return recipe.model if isinstance(recipe, AgentRecipe) and isinstance(recipe.model, str) else None
 
@@ -119,23 +119,23 @@ def resume_run(
     engine: Mapping[str, Any] | None = None,
     **settings: Any,
 ) -> RunLog:
-    """Go on with a run of named parts: only episodes that have not ended are run.
+    """Resume a run whose parts are given by name: only episodes that have not finished are run.
 
     Args:
         run: the run's folder.
-        workers: processes; None means as many as it was begun with.
+        workers: number of processes; None means as many as before.
         progress: whether to show bars.
         retry_errors: whether to rerun episodes that ended with an infrastructure error.
         scratch: folder on a local disk in which the store is written; see `RunConfig`.
-        engine: values of `EngineConfig` in place of those that the run was begun with, such as {"engine": "processes"}.
-        settings: any of `ResumeConfig`'s (live, deadline, cache, cache_gb), from now on in place of the run's own.
+        engine: values of `EngineConfig` that replace the run's, such as {"engine": "processes"}.
+        settings: settings of `ResumeConfig` (live, deadline, cache, cache_gb) that replace the run's from now on.
 
     Raises:
-        ArgumentError: a number out of range, a setting that is fixed once a run is begun, or an address without Ray.
-        StoreError: see `RunStore.resume`; also when the run was begun with objects that exist only in memory, or when
-            its preset's file or the source file of a model, policy or task of the user's own has changed, or the
-            navigation mesh beside a scene has come or gone.
-        FileError: the scene of an episode that is left is not there; nothing is recorded.
+        ArgumentError: a number out of range, a setting that is fixed once a run has started, or an address without Ray.
+        StoreError: see `RunStore.resume`; also if the run was started with objects that exist only in memory, if its
+            preset's file or the source file of the user's own model, policy or task has changed, or if a navigation
+            mesh next to a scene was added or removed.
+        FileError: the scene of a remaining episode does not exist; nothing is recorded.
     """
     if workers is not None:
         RunConfig(workers=workers)  # its numbers are checked there
@@ -145,12 +145,12 @@ def resume_run(
     try:
         place = EngineConfig(**{**store.info.get("engine", {}), **given})
         if place.engine != "ray" and given.get("address") is not None:
-            raise ArgumentError("resume: address is for engine ray: give --engine ray (engine=) as well")
+            raise ArgumentError("resume: address requires engine ray: give --engine ray (engine=) as well")
         if place.engine != "ray":  # each worker has its own model then
             place = EngineConfig(engine=place.engine)
         if "attributes" in store.config:
             own, whole = store.path.parent, store.path.parent.parent
-            raise StoreError(f"{own} holds the reruns of `wiw blame {whole}`; resume them by that command")
+            raise StoreError(f"{own} holds the reruns of `wiw blame {whole}`; resume them with that command")
         task, agents = read_recipes(store)
         update_own_sources(store, task, agents)
         built = task.build()
@@ -188,7 +188,7 @@ def _run(task: Any, agents: Mapping[str, Any], settings: RunConfig, more_arms: b
         begun_with = [arm["name"] for arm in store.config["arms"]]
         require_left(built, store, agents)
         update_own_sources(store, task, {arm: agents[arm] for arm in begun_with})
-        _take_over(store, settings)
+        _apply_settings(store, settings)
         if len(agents) > len(begun_with):
             _add_arms(store, config, _describe_agents(task, agents, built, count))
     else:
@@ -225,21 +225,21 @@ def _run(task: Any, agents: Mapping[str, Any], settings: RunConfig, more_arms: b
 
 
 def _choose_salt(settings: RunConfig) -> str:
-    """Return the salt of a new run: as given, or a random one.
+    """Return the salt of a new run: the given one, or a random one.
 
     Raises:
-        ArgumentError: none is given to a shard, though all shards of a run have the same.
+        ArgumentError: none is given for a shard, although all shards of a run must share one.
     """
     if settings.salt is None and settings.shard is not None:
         raise ArgumentError(
-            f"evaluate: shard {settings.shard} without a salt, which all shards of a run have in common; give each of "
+            f"evaluate: shard {settings.shard} without a salt, which all shards of a run must share; give each of "
             f"them, say, --salt {keys.draw_salt()} (salt=)"
         )
     return keys.draw_salt() if settings.salt is None else settings.salt
 
 
 def _describe_agents(task: Any, agents: Mapping[str, Any], built: Any, count: int) -> dict[str, Any]:
-    """Return what a run store keeps of all arms."""
+    """Return what a run store keeps about all arms."""
     return {
         "agents": {arm: recipe.to_json() for arm, recipe in agents.items()},
         "sources": sources_of(task, agents),
@@ -248,25 +248,25 @@ def _describe_agents(task: Any, agents: Mapping[str, Any], built: Any, count: in
 
 
 def _add_arms(store: RunStore, config: dict[str, Any], info: Mapping[str, Any]) -> None:
-    """Add the arms that a resumed run lacks; closes the store where they must not be added.
+    """Add the arms that a resumed run lacks; close the store if they must not be added.
 
     Raises:
-        StoreError: a rule looks at the run's arms to stop it early, and has not looked at these.
+        StoreError: a rule may stop the run early based on its arms, and has not seen these.
     """
     if "until" in store.info:
         store.close()
         raise StoreError(
-            f"{store.path}: a run that a rule may stop early (--until) has the arms that it was begun with; run the "
-            "new ones in another folder"
+            f"{store.path}: a run that a rule may stop early (--until) keeps the arms that it was started with; run "
+            "the new ones in another folder"
         )
     store.add_arms(config, info)
 
 
-def _take_over(store: RunStore, settings: RunConfig) -> None:
-    """Let a resumed run go on with these settings; closes the store where other things would be measured.
+def _apply_settings(store: RunStore, settings: RunConfig) -> None:
+    """Let a resumed run continue with these settings; close the store if that would change what is measured.
 
     Raises:
-        StoreError: fidelity was measured otherwise so far, or it is another shard, or has another salt.
+        StoreError: fidelity was measured differently so far, or the shard or salt differs.
     """
     begun_with, now = Limits(**store.info["limits"]).to_json(), settings.to_json()
     begun_with["shard"], now["shard"] = store.info.get("shard"), settings.shard
@@ -301,9 +301,9 @@ def _finish(
 
 
 def _make_looks(until: Mapping[str, Any] | None, arms: Sequence[str]) -> StopRule | None:
-    """Return the rule by which a run stops early, from its description in the run store.
+    """Return the rule that may stop a run early, from its description in the run store.
 
     Raises:
-        ArgumentError: a rule that is not understood.
+        ArgumentError: the rule is not understood.
     """
     return None if until is None else parse_stop_rule(until["rule"], arms, until["every"])

@@ -30,7 +30,7 @@ Frames = NDArray[np.uint8]
 
 
 def describe_alteration(truth: Sequence[Frames], found: Sequence[Frames]) -> str:
-    """Describe how all frames [K, H, W, 3] of some rollouts are altered; empty where they are not.
+    """Describe how all frames [K, H, W, 3] of some rollouts are altered; empty if they are not.
 
     `truth` are frames of the same moments, of any size.
     """

@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Judge the stored answers of a run again: nothing is run, and the run's own marks stay.
+"""Judge the stored answers of a run again: nothing is rerun, and the run's own marks are kept.
 
-Marks are stored in the run under the digest of all that they depend on. An answer that could not be judged is an error
-of its episode; the next call asks for what is missing, and for nothing else.
+Marks are stored in the run under the digest of everything that they depend on. An answer that could not be judged is an
+error of its episode; the next call requests only what is missing.
 """
 
 from __future__ import annotations
@@ -26,19 +26,19 @@ from wiw.studies.run_log import RunLog, load_run
 from wiw.tasks.answer_record import AnswerRecord, read_judgements
 
 SERVER_ERRORS = 5
-"""Answers in a row for which the language model could not be asked, after which no more are asked about."""
+"""Consecutive answers for which the language model could not be reached, after which no more are requested."""
 Item = tuple[int, str]
-"""Episode and answer: equal answers of several arms to one question are judged once."""
+"""Episode and answer: equal answers by several arms to one question are judged once."""
 
 
 @dataclass(frozen=True)
 class MissingMarks:
-    """An episode of an arm that a judge has not marked."""
+    """An arm's episode that a judge has not marked."""
 
     arm: str
     episode: int
     error: str
-    """Why, in a line."""
+    """The reason, in one line."""
     kind: str
 
 
@@ -54,48 +54,49 @@ class JudgedRun:
     known: int
     """Answers that the judge had marked before."""
     missing: tuple[MissingMarks, ...]
-    """Episodes without marks; the next call asks for these."""
+    """Episodes without marks; the next call requests these."""
     stopped: str = ""
-    """Why not all answers were asked about; empty where they were."""
+    """Why some answers were not judged; empty if all were."""
 
     @property
     def complete(self) -> bool:
-        """Whether every episode that came to its end has marks."""
+        """Whether every finished episode has marks."""
         return not self.missing
 
 
 def judge(
     run: str | Path | RunLog, judge: str | Judge = "rules", *, progress: bool = True, **options: Any
 ) -> JudgedRun:
-    """Judge the stored answers of a run, and compute all metrics that depend on marks anew.
+    """Judge the stored answers of a run, and recompute all metrics that depend on marks.
 
         found = wiw.judge("runs/first", "rules+llm:http://localhost:8000/v1#gpt-4o-mini", temperature=0.0)
         found.log.summary()                                      # with the marks of that judge
-        wiw.load_run("runs/first", judge="rules+llm").summary()  # the same later
+        wiw.load_run("runs/first", judge="rules+llm").summary()  # later, the same
 
     Args:
         run: the run's folder.
         judge: see `wiw.judging.make_judge`.
         progress: whether to show a bar.
-        options: of a language model as judge, such as temperature, seed, prompts, timeout; see `LanguageModelJudge`.
+        options: options of a language model as judge, such as temperature, seed, prompts, timeout; see
+            `LanguageModelJudge`.
 
     Raises:
-        ArgumentError: another judge, or options without a language model.
-        StoreError: no readable run, one that is being written, or whose task has no answers in words.
+        ArgumentError: an unknown judge, or options without a language model.
+        StoreError: the run cannot be read, is being written, or its task has no answers in words.
         VlmError: the model's name was not given, and its server cannot be asked for it.
     """
     folder = run.path if isinstance(run, RunLog) else Path(run)
     made = make_judge(judge, **options)
     with RunStore.annotate(folder) as store:
-        marking = _Marking(store, made)
+        marking = _JudgingPass(store, made)
         marking.mark_missing(progress)
         missing = tuple(marking.list_missing())
     log = load_run(folder, judge=marking.judge.digest)
     return JudgedRun(log, marking.judge, marking.asked, marking.known_before, missing, marking.stopped)
 
 
-class _Marking:
-    """The answers of a run on their way through a judge."""
+class _JudgingPass:
+    """One pass of a judge over the answers of a run."""
 
     def __init__(self, store: RunStore, made: Judge) -> None:
         self._store, self._made = store, made
@@ -113,7 +114,7 @@ class _Marking:
         self.known_before = len(self._found)
 
     def _read_known(self, judged: Mapping[tuple[str, int], Mapping[str, Any]]) -> Iterator[tuple[Item, Judgement]]:
-        """Yield the judge's marks that the store has, also those of episodes of which another answer is missing."""
+        """Yield the judge's stored marks, including those of episodes with another answer missing."""
         rows = [(episode, row["details"]) for (_, episode), row in judged.items()]
         if self.judge.own:
             rows += [(episode, row["details"]) for (_, episode), (row, _) in self._records.items()]
@@ -122,7 +123,7 @@ class _Marking:
                 yield (episode, answer), judgement
 
     def mark_missing(self, progress: bool) -> None:
-        """Judge what is missing; write each outcome as soon as its answers are judged."""
+        """Judge what is missing, and write each outcome as soon as its answers are judged."""
         wanted = {(key[1], answer): None for key in self._left for answer in self._records[key][1].answers}
         items = [item for item in wanted if item not in self._found]
         if self._left:
@@ -142,7 +143,7 @@ class _Marking:
             board.close()
 
     def _ask(self, items: Sequence[Item]) -> Iterator[tuple[Item, Judgement | Exception]]:
-        """Yield the outcome of each item as it comes, until the language model cannot be asked any more."""
+        """Yield the outcome of each item as it arrives, until the language model can no longer be reached."""
         references = {key[1]: record.reference for key, (_, record) in self._records.items()}
         width, waiting, in_a_row = self._made.concurrency, deque(items), 0
         pool = ThreadPoolExecutor(width, thread_name_prefix="wiw judge")
@@ -158,14 +159,14 @@ class _Marking:
                     outcome = done.result()
                     in_a_row = in_a_row + 1 if isinstance(outcome, VlmError) else 0
                     if in_a_row >= max(SERVER_ERRORS, width) and waiting:
-                        self.stopped = f"{len(waiting)} answers were not asked about, since the last {in_a_row} ended "
+                        self.stopped = f"{len(waiting)} answers were not judged, as the last {in_a_row} ended "
                         self.stopped += f"with an error of the language model: {outcome}"
                     yield running.pop(done), outcome
         finally:
             pool.shutdown(wait=False, cancel_futures=True)
 
     def _write_ready(self, episode: int | None = None) -> None:
-        """Write the outcomes (of an episode) all of whose answers have been judged, or could not be."""
+        """Write the outcomes (of an episode) whose answers have all been judged, or could not be."""
         left = []
         for key in self._left:
             record = self._records[key][1]
@@ -194,7 +195,7 @@ class _Marking:
                 continue
             found = judged.get((arm, episode))
             if found is None:
-                yield MissingMarks(arm, episode, "not asked about yet", "judge/missing")
+                yield MissingMarks(arm, episode, "not requested yet", "judge/missing")
             elif found["status"] == "error":
                 yield MissingMarks(arm, episode, found["error"], found["kind"])
 
@@ -203,7 +204,7 @@ def read_answers(store: RunStore) -> dict[tuple[str, int], tuple[dict[str, Any],
     """Return the outcomes of a run that can be judged, each with its answers, by arm and episode.
 
     Raises:
-        StoreError: the run's task has no answers in words, or is not known here.
+        StoreError: the run's task has no answers in words, or is unknown here.
     """
     task, episodes = _find_task(store), store.episodes()
     found = {}
@@ -219,7 +220,7 @@ def judge_answer(judge: Judge, reference: Reference, answer: str) -> Judgement |
     """Return the judgement of an answer, or why there is none.
 
     Raises:
-        Error: judging cannot work at all, as without a package that it needs.
+        Error: judging cannot work at all, for example without a required package.
     """
     try:
         outcome: Judgement | Exception = judge.judge_each([reference], [answer])[0]
@@ -236,17 +237,17 @@ def _find_task(store: RunStore) -> Any:
     """Return the class of a run's task.
 
     Raises:
-        StoreError: it has no answers in words, or is not known here.
+        StoreError: it has no answers in words, or is unknown here.
     """
     task, recipe = store.config["task"].get("task"), store.info["task"]
     if not store.judges:
         raise StoreError(
-            f"{store.path.parent} is a run of task '{task}', whose outcomes do not depend on a judge; expected one "
+            f"{store.path.parent} is a run of task '{task}', whose outcomes do not depend on a judge; expected a task "
             "with answers in words, such as aeqa"
         )
     if not recipe and task not in TASKS.names():
         raise StoreError(
-            f"{store.path.parent} was begun with a task in memory, '{task}', that is not registered; register it in "
-            "the entry points 'wiw.tasks' (docs/write-your-own-task.md)"
+            f"{store.path.parent} was started with a task in memory, '{task}', that is not registered; register it "
+            "under the entry points 'wiw.tasks' (docs/write-your-own-task.md)"
         )
     return task_class(recipe["name"] if recipe else task)

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Check a world model's contract by requests like the loop's, with findings in plain words."""
+"""Check a world model's contract with requests like the loop's, and report findings in plain words."""
 
 from __future__ import annotations
 
@@ -30,11 +30,11 @@ from wiw.world_models.base import WorldModel
 from wiw.world_models.pictures import CLOSE, OTHER
 
 WALKS = ((FORWARD, TURN_LEFT, FORWARD, FORWARD), (FORWARD, TURN_LEFT, TURN_RIGHT, TURN_RIGHT), (FORWARD,) * 4)
-"""No leading turns, which the loop makes itself. The first two begin alike, for models that say they are causal."""
+"""Plans without leading turns, which the loop makes itself. The first two share a beginning, for causal models."""
 
 
 def _poses(*places: tuple[float, float, float]) -> tuple[tuple[float, ...], ...]:
-    """Return poses with the hand down, open, and shut at the last."""
+    """Return poses with the hand down, open until the last, which is closed."""
     return tuple((*place, np.pi, 0.0, 0.0, float(i + 1 < len(places))) for i, place in enumerate(places))
 
 
@@ -43,53 +43,53 @@ POSES = (
     _poses((0.1, 0.0, 1.05), (0.15, 0.05, 1.0), (0.2, -0.1, 0.95), (0.2, -0.2, 0.85)),
     _poses((0.2, 0.0, 1.1), (0.25, 0.0, 1.05), (0.3, 0.0, 1.0), (0.3, 0.0, 0.95)),
 )
-"""Likewise of a gripper, over the table."""
+"""The same for a gripper above the table."""
 PLANS: Mapping[str, Any] = {PRIMITIVES: WALKS, GRIPPER_POSES: POSES}
 LENGTH = 4
-"""Actions of each."""
+"""Actions in each plan."""
 ALIKE = 2
-"""Actions with which the first two begin."""
+"""Actions that the first two plans share."""
 SHORT = 2
-"""Actions of a second length, for models that take any."""
+"""A second plan length, for models that take any."""
 NOISE = 8
-"""Levels of 255 up to which a difference may come of rounding."""
+"""Grey levels, of 255, up to which a difference may be due to rounding."""
 MARGIN = 0.06
-"""By how much another order of the frames has to fit better, in correlation."""
+"""How much better, in correlation, another order of the frames must fit."""
 MANY_JUMPS = 0.005
-"""Share of neighbouring pixels that jump from black to white in no ordinary picture."""
+"""Share of neighbouring pixels that jump from black to white, which ordinary images never reach."""
 SETTLE = 0.3
-"""Seconds in which an answer that is still written to changes."""
+"""Seconds to wait for changes to an answer that is still being written to."""
 PICTURES: Mapping[str, str] = {"channels": "pictures", "scale": "pictures"}
-"""Kinds of a `ContractError` that belong to another check than the one in which they came up."""
+"""Kinds of `ContractError` that belong to a different check than the one that raised them."""
 RUNS: Mapping[str, tuple[str, int]] = {
     PRIMITIVES: ("100 episodes of ImageNav", 100 * 20 * 3),
     GRIPPER_POSES: ("200 episodes of manipulation", 200 * 3 * 5),
 }
-"""The paper's, in words, and the rows that it asks for: episodes, decisions and plans, roughly."""
+"""The paper's runs, in words, and roughly how many rows they request: episodes times decisions times plans."""
 LONG_RUN = 24.0
-"""Hours from which such a run is called slow."""
+"""Hours above which such a run is called slow."""
 
 
 Result = Literal["passed", "wrong", "note", "skipped"]
 CHECKS: Mapping[str, str] = {
-    "construction": "It can be made, and an agent can give it what it needs",
+    "construction": "It can be built, and an agent can give it what it needs",
     "answer": "It answers in time, with uint8 [rows, actions + 1, height, width, 3], no NaN",
     "frame 0": "Frame 0 is the observation",
-    "pictures": "Frames are upright pictures of the place in RGB from 0 to 255",
+    "pictures": "Frames are upright images of the place, in RGB from 0 to 255",
     "plan": "Frame k shows what follows action k, and different plans give different frames",
     "training": "Its networks are in evaluation mode",
     "random": "The same seeds give the same frames",
-    "batch": "A row does not depend on the rows beside it",
-    "causal": "As declared (causal), frames depend on no later action",
-    "history": "What was observed before makes a difference, if it needs that",
-    "inputs": "It leaves alone what it is given",
-    "memory": "It leaves alone what it has answered",
-    "length": "It takes plans of another length",
-    "size": "It answers in the smallest size that it declares, too",
+    "batch": "A row does not depend on the other rows in its batch",
+    "causal": "Frames do not depend on later actions, as declared (causal)",
+    "history": "Past observations make a difference, if it declares to need them",
+    "inputs": "It does not modify its inputs",
+    "memory": "It does not modify earlier outputs",
+    "length": "It accepts plans of other lengths",
+    "size": "It also works at the smallest size that it declares",
     "identity": "It describes itself as JSON, and has a version if its rollouts are to be cached",
     "speed": "How long a rollout takes",
 }
-"""What is looked at, in this order."""
+"""The checks, in this order."""
 
 
 @dataclass(frozen=True)
@@ -100,9 +100,9 @@ class Finding:
     """"needs", "raised", "deadline", the kind of a `ContractError`, "frame 0", "pictures", "training", "random",
     "batch", "causal", "history", "plan", "inputs", "memory", "describe", "version", or "slow"."""
     text: str
-    """The fault, what was seen, and what to do."""
+    """What is wrong, what was seen, and what to do."""
     serious: bool = True
-    """Whether the contract is broken; else it is good to know."""
+    """Whether the contract is broken; otherwise it is only a note."""
 
     def __str__(self) -> str:
         return self.text
@@ -118,11 +118,11 @@ class Check:
     skipped: str = ""
     """Reason why the check was skipped; empty if it was not."""
     detail: str = ""
-    """Further remark, such as a time."""
+    """A remark, such as a time."""
 
     @property
     def result(self) -> Result:
-        """In one word."""
+        """The result in one word."""
         if any(finding.serious for finding in self.findings):
             return "wrong"
         return "note" if self.findings else "skipped" if self.skipped else "passed"
@@ -136,23 +136,23 @@ def check_model(
         for finding in wiw.check_model(MyModel()):
             print(finding)
 
-    Looked at are type, dtype, shape, number of frames and NaN; frame 0; channel order, scale, orientation and order in
-    time of the frames, beside what an agent would truly see; networks left in training mode; what it does to its
-    inputs and to earlier answers; whether the same seeds give the same frames, whether a row depends on those beside
-    it, whether `causal` is true, whether the plan and, of a model that needs it, the history make a difference, and how
-    long it takes, if it answers at all.
+    Checks cover type, dtype, shape, number of frames and NaN; frame 0; channel order, scale, orientation and temporal
+    order of the frames, compared with what an agent would truly see; networks left in training mode; changes to inputs
+    and to earlier outputs; whether the same seeds give the same frames, whether a row depends on the others in its
+    batch, whether `causal` holds, whether the plan and (for a model that needs it) the history make a difference; and
+    how long a rollout takes, if it returns at all.
 
     Args:
         model: as `wiw.world_model` takes it: name, `path.py:Class`, class, instance, "remote:ws://...".
-        scenes: where the observations come from; of a model that takes poses, from the tables of manipulation.
-        deadline: seconds that a call or the constructor may take, after which it is not asked any more.
-        options: what the model is made with.
+        scenes: where the observations come from; for a model that takes poses, the tables of manipulation.
+        deadline: time limit in seconds for a call or the constructor, after which checking stops.
+        options: the model's options.
 
     Returns:
-        Findings, none where nothing is wrong; the contract is broken where one is `serious`.
+        Findings, empty if nothing is wrong; the contract is broken if one is `serious`.
 
     Raises:
-        RegistryError: no such model; other errors of wiw where it cannot be made.
+        RegistryError: no such model; other errors of wiw if it cannot be built.
         ArgumentError: a deadline that is not above 0.
     """
     checks = examine_model(model, scenes, deadline=deadline, **options)
@@ -169,13 +169,13 @@ def examine_model(
         made = make_model(model, deadline, **options)
     except ConstructionError as error:
         cause = error.__cause__
-        text = f"{error}." if cause is None or error.kind == "deadline" else f"It cannot be made: {_locate(cause)}."
+        text = f"{error}." if cause is None or error.kind == "deadline" else f"It cannot be built: {_locate(cause)}."
         return _build_failed_checks(Finding(error.kind, text))
     if made is None:
-        raise ArgumentError("check-model: 'none' stands for no world model; see `wiw list` for those that there are")
+        raise ArgumentError("check-model: 'none' stands for no world model; see `wiw list` for the available ones")
     try:
         if made.accepts.space not in PLANS:
-            raise ArgumentError(f"check-model knows plans in {', '.join(PLANS)}, and the model takes others")
+            raise ArgumentError(f"check-model knows plans in {', '.join(PLANS)}, but the model takes others")
         plan_space(made.accepts.space).check_model(made, LENGTH)
     except ArgumentError as error:
         return _build_failed_checks(Finding("needs", f"{error}."))
@@ -185,7 +185,7 @@ def examine_model(
 def _build_failed_checks(finding: Finding) -> list[Check]:
     """Return all checks, the first failed and the others skipped."""
     first, *others = CHECKS
-    return [Check(first, (finding,)), *(Check(name, skipped="there is no model to ask") for name in others)]
+    return [Check(first, (finding,)), *(Check(name, skipped="there is no model to check") for name in others)]
 
 
 class _ModelExaminer:
@@ -243,14 +243,14 @@ class _ModelExaminer:
         except LateError:
             finding = Finding(
                 "deadline",
-                f"No answer in {self.deadline:g} s, so the check stopped. In a run such a call is made three times, "
-                "then its episode ends with an error. Does it wait for a download, a lock, a server or a prompt? If it "
-                "is only slow, give it a longer deadline, here and in the run, or a smaller best_batch.",
+                f"No answer in {self.deadline:g} s, so the check stopped. In a run, such a call is tried three times "
+                "before its episode ends with an error. Is it waiting for a download, a lock, a server or a prompt? "
+                "If it is just slow, give it a longer deadline, here and in the run, or a smaller best_batch.",
             )
         except ExitError as error:
             cause = error.__cause__
             said = error if cause is None else _locate(cause)
-            text = f"`rollout` raised {said}. Raise an Exception to report a failure."
+            text = f"`rollout` raised {said}. Raise an Exception to report an error."
             finding = Finding("raised", text)
         except Exception as error:
             finding = Finding("raised", f"`rollout` raised {_locate(error)}.")
@@ -266,7 +266,7 @@ class _ModelExaminer:
             return "every comparison would fail: its answers are random"
         declared = {
             "causal": not self.accepts.causal and "it declares causal=False",
-            "history": self.accepts.history < 2 and "it needs none",
+            "history": self.accepts.history < 2 and "it needs no history",
             "length": self.accepts.frames and f"it declares {self.accepts.frames} frames",
             "size": self._find_size_skip_reason(),
         }
@@ -274,7 +274,7 @@ class _ModelExaminer:
 
     def _find_size_skip_reason(self) -> str:
         if not self.accepts.is_scalable:
-            return "it declares one size"
+            return "it declares only one size"
         return "the history that it needs was observed in the largest size" if self.accepts.history else ""
 
     def _check_answer(self) -> Iterator[Finding]:
@@ -300,15 +300,15 @@ class _ModelExaminer:
         if off.mean() <= CLOSE:
             yield Finding(
                 "frame 0",
-                f"Frame 0 is the observation only nearly: {difference}, as of a picture that was encoded and decoded. "
-                "That costs next to nothing; frames[:, 0] = observations.image corrects it.",
+                f"Frame 0 is only nearly the observation: {difference}, as after encoding and decoding an image. It "
+                "makes next to no difference; frames[:, 0] = observations.image fixes it.",
                 serious=False,
             )
         else:
             yield Finding(
                 "frame 0",
                 f"Frame 0 is not the observation: {difference}. Frame k is what follows action k; put the observation "
-                "in front: frames[:, 0] = observations.image.",
+                "first: frames[:, 0] = observations.image.",
             )
 
     def _check_pictures(self) -> Iterator[Finding]:
@@ -317,16 +317,16 @@ class _ModelExaminer:
         if jumps > MANY_JUMPS + 4 * usual:
             yield Finding(
                 "pictures",
-                f"Values wrap around: in {jumps:.1%} of places neighbouring pixels jump from nearly 0 to nearly 255 "
+                f"Values wrap around: at {jumps:.1%} of positions neighbouring pixels jump from nearly 0 to nearly 255 "
                 f"(in the observations: {usual:.1%}). Clip before the cast: np.clip(frames, 0, 255).astype(np.uint8).",
             )
             return
         if fault := describe_alteration(self._truth, own):
-            yield Finding("pictures", f"After frame 0, {fault}, beside what an agent would truly see.")
+            yield Finding("pictures", f"After frame 0, {fault}, compared with what an agent would truly see.")
 
     @cached_property
     def _truth(self) -> list[Frames]:
-        """Frames that an agent would truly see after each action of each row's plan."""
+        """The frames that an agent would truly see after each action of each row's plan."""
         return self.queries.true_frames(self.rows, [row.plan for row in self.rows])
 
     def _select_action_frames(self) -> list[Frames]:
@@ -344,8 +344,8 @@ class _ModelExaminer:
         if all(np.array_equal(one[1 : 1 + self.steps], other[1 : 1 + self.steps]) for one, other in pairs):
             yield Finding(
                 "plan",
-                "Different plans gave the same frames, so it cannot tell an agent which one is better. Does `rollout` "
-                f"read the control that it declares ('{self.accepts.control}')?",
+                "Different plans gave the same frames, so they cannot tell an agent which plan is better. Does "
+                f"`rollout` read the control that it declares ('{self.accepts.control}')?",
                 serious=False,
             )
             return
@@ -355,23 +355,23 @@ class _ModelExaminer:
             yield Finding(
                 "plan",
                 "Time runs backwards: the frames are those of the plan from its end to its beginning. Frame k is what "
-                "follows action k: frames[:, 1:] = frames[:, :0:-1] turns them round.",
+                "follows action k: frames[:, 1:] = frames[:, :0:-1] reverses them.",
             )
         elif self.accepts.space == PRIMITIVES:
             swapped = self.queries.true_frames(self.rows, [swap_turns(row.plan) for row in self.rows])
             if mean_correlation(swapped, own) > max(OTHER, alike + MARGIN):
                 yield Finding(
                     "plan",
-                    "Left and right are exchanged: the frames are those of the plan with every turn to the other side. "
-                    "Azimuths grow to the left (docs/conventions.md).",
+                    "Left and right are swapped: the frames are those of the plan with every turn mirrored. Azimuths "
+                    "increase to the left (docs/conventions.md).",
                 )
 
     def _check_training_mode(self) -> Iterator[Finding]:
         for path, layers in find_training_networks(self.model):
             yield Finding(
                 "training",
-                f"{path} is in training mode, with {', '.join(layers)}: dropout draws without the seeds, and batch "
-                "statistics mix the rows. Call .eval() on it once it is loaded.",
+                f"{path} is in training mode, with {', '.join(layers)}: dropout ignores the seeds, and batch "
+                "statistics mix the rows. Call .eval() on it after loading.",
             )
 
     def _check_determinism(self) -> Iterator[Finding]:
@@ -381,8 +381,8 @@ class _ModelExaminer:
             yield self._build_difference_finding(
                 "random",
                 f"In two calls with the same seeds, {_count_rows(off)} differ, by up to {off.max()} of 255. Draw noise "
-                "from the row's own seed, as torch.Generator().manual_seed(int(seed)), switch dropout off (eval()), "
-                "and keep nothing from one call to the next.",
+                "from the row's own seed, with torch.Generator().manual_seed(int(seed)), switch dropout off (eval()), "
+                "and keep no state between calls.",
                 off,
             )
 
@@ -394,10 +394,10 @@ class _ModelExaminer:
         if off.any():
             yield self._build_difference_finding(
                 "batch",
-                f"A row depends on the rows beside it: alone, {_count_rows(off)} differ from the same in a batch of "
-                f"{min(len(rows), self.accepts.best_batch)}, by up to {off.max()} of 255. Draw each row's noise from "
-                "its own seed, not the batch's from the first one, and mix no statistics over the batch (BatchNorm in "
-                "training).",
+                f"A row depends on the other rows in its batch: alone, {_count_rows(off)} differ from the same rows in "
+                f"a batch of {min(len(rows), self.accepts.best_batch)}, by up to {off.max()} of 255. Draw each row's "
+                "noise from its own seed, not the whole batch's from the first one, and do not mix statistics over "
+                "the batch (BatchNorm in training mode).",
                 off,
             )
 
@@ -416,8 +416,8 @@ class _ModelExaminer:
         if off.any():
             yield self._build_difference_finding(
                 "causal",
-                f"It declares causal=True, but frames before a changed action change with it, by up to {off.max()} "
-                "of 255; plans that begin alike would share frames that are not theirs. Declare causal=False.",
+                f"It declares causal=True, but frames before a changed action change too, by up to {off.max()} of 255; "
+                "plans with a common beginning would share wrong frames. Declare causal=False.",
                 off,
             )
 
@@ -426,14 +426,14 @@ class _ModelExaminer:
         if not _compute_differences(young, self.frames, 0, self.steps).any():
             yield Finding(
                 "history",
-                "What was observed before makes no difference: at an episode's first moment its frames are the same. "
-                "Does `rollout` read `observations.history`? If it needs none, leave it out of `needs`.",
+                "Past observations make no difference: at the start of an episode its frames are the same. Does "
+                "`rollout` read `observations.history`? If it does not need it, remove it from `needs`.",
                 serious=False,
             )
 
     def _check_inputs(self) -> Iterator[Finding]:
         if changed := self.queries.watch().changed:
-            yield Finding("inputs", f"It changes what it is given: {', '.join(changed)}. Work on a copy.")
+            yield Finding("inputs", f"It modifies its inputs: {', '.join(changed)}. Work on a copy.")
 
     def _check_memory(self) -> Iterator[Finding]:
         time.sleep(SETTLE)  # for a thread that still writes
@@ -441,27 +441,26 @@ class _ModelExaminer:
         if watched.reuses:
             yield Finding(
                 "memory",
-                "An answer lies in the memory of an earlier one, which is still looked at when the next call is made. "
-                "Return an array of its own, as frames.copy().",
+                "An answer uses the memory of an earlier one, which is still in use when the next call is made. "
+                "Return a new array, such as frames.copy().",
             )
         elif watched.rewrites:
             yield Finding(
                 "memory",
-                "An answer was written to after it was returned, while it was being looked at: by a later call, a "
-                "thread, or a copy from the GPU that nobody waited for. Return an array that nobody else holds, once "
-                "it is whole.",
+                "An answer was written to after it was returned, while it was in use: by a later call, a thread, or "
+                "an asynchronous copy from the GPU. Return an array that nothing else refers to, once it is complete.",
             )
 
     def _check_identity(self) -> Iterator[Finding]:
         try:
             json.dumps(self.model.describe())
         except Exception as error:
-            yield Finding("describe", f"`describe` gives no JSON for the run's record: {_locate(error)}.")
+            yield Finding("describe", f"`describe` does not return JSON for the run's record: {_locate(error)}.")
         if self.accepts.cacheable and not self.model.fingerprint():
             yield Finding(
                 "version",
-                "It declares cacheable=True, but no version, so nothing is cached. Give the class one, as "
-                "`version = '1'`, and raise it whenever its answers change.",
+                "It declares cacheable=True but no version, so nothing is cached. Give the class one, such as "
+                "`version = '1'`, and change it whenever its answers change.",
             )
 
     def _measure_speed(self) -> Check:
@@ -473,22 +472,23 @@ class _ModelExaminer:
         detail = f"{self.row_seconds:.3g} s a rollout of {self.steps} actions, {batch} at a time"
         found = Finding(
             "slow",
-            f"A row takes {self.row_seconds:.3g} s. A run of {run} asks for about {rows} of them: "
-            f"{hours:.0f} hours. Fewer denoising steps, a larger best_batch or `wiw "
-            "serve` on a faster machine make it shorter; --cache asks nothing twice.",
+            f"A row takes {self.row_seconds:.3g} s. A run of {run} requests about {rows} of them: {hours:.0f} hours. "
+            "Fewer denoising steps, a larger best_batch or `wiw serve` on a faster machine shorten it; --cache never "
+            "computes the same rollout twice.",
             serious=False,
         )
         return Check("speed", (found,) if hours > LONG_RUN else (), detail=detail)
 
     def _build_difference_finding(self, kind: str, text: str, off: NDArray[np.int16]) -> Finding:
-        """Return a finding, which is not serious where it may be rounding."""
+        """Return a finding, which is not serious if it may be due to rounding."""
         if off.max() > NOISE:
             return Finding(kind, text)
         where = find_place_of_computation(self.model)
         cause = {
-            "gpu": "So little may come of the order in which a GPU adds up.",
-            "cpu": "So little may be rounding: a CPU adds up in another order where batches or threads differ.",
-            "elsewhere": "So little may be rounding on the machine that computes it.",
+            "gpu": "A difference this small may come from the order of additions on a GPU.",
+            "cpu": "A difference this small may be rounding: a CPU adds in a different order if batches or threads "
+            "differ.",
+            "elsewhere": "A difference this small may be rounding on the machine that computes it.",
         }
         return Finding(kind, f"{text} {cause[where]}", serious=False)
 
@@ -509,7 +509,7 @@ def _first_moment(history: History | None) -> History:
 
 
 def _pairs(rows: Sequence[Row]) -> list[tuple[Row, Row]]:
-    """Return rows with different plans from the same place."""
+    """Return pairs of rows with different plans from the same place."""
     return [(one, other) for one, other in combinations(rows, 2) if np.array_equal(one.image, other.image)]
 
 

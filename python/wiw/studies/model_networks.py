@@ -25,14 +25,14 @@ def find_training_networks(model: WorldModel) -> list[tuple[str, list[str]]]:
 
 def find_place_of_computation(model: WorldModel) -> str:
     """Return where a model computes, wherever it runs; see `place_of_computation`."""
-    return str(model.ask(_tell_place)) if isinstance(model, IsolatedModel) else place_of_computation(model)
+    return str(model.ask(_find_place)) if isinstance(model, IsolatedModel) else place_of_computation(model)
 
 
 def _list_training_networks(host: Host) -> list[tuple[str, list[str]]]:
     return training_networks(host.made.unwrapped)
 
 
-def _tell_place(host: Host) -> str:
+def _find_place(host: Host) -> str:
     return place_of_computation(host.made.unwrapped)
 
 
@@ -84,10 +84,10 @@ def _parts(value: Any) -> Iterator[tuple[str, Any]]:
 
 def _training_layers(network: Any) -> list[str]:
     """Return the kinds of a network's layers that draw at random or mix rows as they are now."""
-    return sorted({type(layer).__name__ for layer in network.modules() if layer.training and _acts_otherwise(layer)})
+    return sorted({type(layer).__name__ for layer in network.modules() if layer.training and _depends_on_mode(layer)})
 
 
-def _acts_otherwise(layer: Any) -> bool:
+def _depends_on_mode(layer: Any) -> bool:
     """Return whether a layer behaves differently in training mode."""
     from torch.nn.modules.batchnorm import _BatchNorm
     from torch.nn.modules.dropout import _DropoutNd

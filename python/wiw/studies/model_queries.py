@@ -43,7 +43,7 @@ class Row:
     history: History | None
     """History of one row."""
     simulator: Any
-    """As the model is handed it, if it is."""
+    """As the model is given it, if it is."""
     control: Control
     seed: np.uint64
     truth: Any

@@ -1,9 +1,9 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Does a world model that looks better help more? Imagined frames are scored and set beside success.
+"""Do better-looking frames help more? Score imagined frames and compare the scores with success.
 
-The paper's question ("Fine-grained controllability matters more than visuals for task success"): quality is what a
-frame looks like by itself, controllability how near it is to what would really have been seen. Both are taken of the
-same frames for all arms, as the run's store keeps them.
+The paper's question ("Fine-grained controllability matters more than visuals for task success"): quality is how good a
+frame looks on its own, controllability how close it is to what would really have been seen. Both are measured on the
+same frames for all arms, as kept in the run's store.
 """
 
 from __future__ import annotations
@@ -55,18 +55,18 @@ from wiw.studies.compare import require_comparable
 from wiw.studies.run_log import RunLog, load_run
 
 FRAMES = 200
-"""Default number of frames of each arm."""
+"""Default number of frames per arm."""
 ALWAYS = "pixels"
-"""The scorer that needs nothing and takes no time."""
+"""The scorer that needs nothing and takes next to no time."""
 VIEW = (128, 128)
-"""Height and width of the views of a panorama that LPIPS is taken of."""
+"""Height and width of the views of a panorama on which LPIPS is computed."""
 MOST_AT_ONCE = 256
-"""Frames that an actor scores between two answers."""
+"""Maximum number of frames that an actor scores per call."""
 SHOWN = 6
-"""Frames of each arm that the page shows."""
+"""Frames per arm shown on the page."""
 
 Watch = Callable[[str, int, int, str], None]
-"""Called with what is done, how much of it, out of how much, and a text."""
+"""Called with what is being done, how much is done, out of how much, and a text."""
 Image = NDArray[np.uint8]
 
 
@@ -78,10 +78,11 @@ class Quality:
     out: Path
     """Folder that `save` writes into."""
     pictures: Mapping[str, Sequence[Image]] = field(repr=False, default_factory=dict)
-    """Some of the scored frames by arm, the same of each, uint8 [H, W, 3]; "true": what would really have been seen."""
+    """Some of the scored frames, the same ones for each arm, uint8 [H, W, 3]; "true": what would really have been
+    seen."""
 
     def summary(self) -> None:
-        """Print the tables and what to bear in mind with them."""
+        """Print the tables, with notes on how to read them."""
         from wiw.report.quality_tables import print_quality
 
         print_quality(self.table)
@@ -111,7 +112,7 @@ class _Arm:
 
     @cached_property
     def digests(self) -> dict[FrameKey, str]:
-        """Digests of `frames`, once these are read."""
+        """Digests of `frames`, once these have been read."""
         return {key: digest_frame(frame) for key, frame in self.frames.items()}
 
 
@@ -134,28 +135,30 @@ def quality(
         found.summary()
         found.save()
 
-    Scores are stored in `quality.sqlite` beside each run: a call that was killed, or one for more frames, scores only
-    what is missing.
+    Scores are stored in `quality.sqlite` next to each run, so after an interruption, or with more frames, only what is
+    missing is scored.
 
     Args:
-        runs: folders of runs, one or several of the same task, seed and episodes, or `RunLog`s. Only episodes that
-            kept pictures (`keep_images`) have frames.
-        scorers: "laion", "laion:FOLDER", or commands (see `wiw.scorers.process`), besides sharpness and colourfulness.
-        frames: to score of each arm; the same ones of each.
-        arms: to compare; all that imagine if not given. Arms of several runs are called RUN/ARM where names repeat.
-        lpips: folder of the weights of LPIPS, or "auto"; controllability is 1 - LPIPS then, else SSIM.
-        out: folder for `save`; `quality` in the first run's folder if not given.
+        runs: folders of runs, one or several with the same task, seed and episodes, or `RunLog`s. Only episodes that
+            kept images (`keep_images`) have frames.
+        scorers: "laion", "laion:FOLDER", or commands (see `wiw.scorers.process`), in addition to sharpness and
+            colourfulness.
+        frames: number of frames to score per arm, the same ones for each.
+        arms: arms to compare; by default all with a world model. Arms of several runs are called RUN/ARM if names
+            repeat.
+        lpips: folder of the weights of LPIPS, or "auto"; controllability is then 1 - LPIPS, otherwise SSIM.
+        out: folder for `save`; by default `quality` in the first run's folder.
         deadline: seconds that a command may be silent.
-        workers: number of actors of Ray, each with scorers of its own.
+        workers: number of Ray actors, each with its own scorers.
         place: this process, or actors on a Ray cluster that score the frames; sharpness and colourfulness are computed
             here.
         watch: called with progress.
 
     Raises:
-        ArgumentError: a number out of range, an arm that is not there, or no frames that all arms have imagined.
+        ArgumentError: a number out of range, an arm that does not exist, or no frames that all arms have imagined.
         StoreError: runs that cannot be read or compared, or scores that cannot be written.
-        ScorerError: a command gave no valid scores; those before are stored.
-        WeightsError: weights that a scorer needs are not there.
+        ScorerError: a command gave no valid scores; earlier scores are stored.
+        WeightsError: weights that a scorer needs are missing.
     """
     if frames < 1:
         raise ArgumentError(f"quality: expected frames of at least 1, got {frames}")
@@ -173,7 +176,9 @@ def quality(
         chosen, notes = _choose_arms(logs, arms)
         keys = _choose_frames(chosen, frames)
         if len(keys) < frames:
-            notes.append(f"{frames} frames were asked for; all arms have imagined the same future in {len(keys)} only.")
+            notes.append(
+                f"{frames} frames were requested, but all arms have imagined the same future in only {len(keys)}."
+            )
         for arm in chosen:
             arm.frames = dict(read_frames(arm.log.store, arm.places, keys))
         _find_truth(logs, chosen, keys)
@@ -181,7 +186,7 @@ def quality(
         cards = _score_all([ALWAYS, *scorers], chosen, stores, _Scoring(deadline, workers, place, watch))
         _compare_with_truth(chosen, stores, judged, watch)
         if not any(arm.true for arm in chosen):
-            notes.append("No true frames, so no controllability: run with --fidelity, or with arm oracle.")
+            notes.append("No controllability, as there are no true frames: run with --fidelity, or with an oracle arm.")
         table = _summarise(chosen, cards, notes, logs[0])
     folder = Path(out) if out is not None else logs[0].path / "quality"
     return Quality(table, folder, _choose_pictures(chosen, keys))
@@ -217,14 +222,14 @@ def _choose_arms(logs: Sequence[RunLog], wanted: Sequence[str] | None) -> tuple[
     if len(without) == len(found):
         raise ArgumentError(
             f"quality: no imagined frames of {', '.join(without)} in {', '.join(str(log.path) for log in logs)}; run "
-            "world models and keep pictures (`wiw run --keep-images N`, or keep_images=)"
+            "world models and keep images (`wiw run --keep-images N`, or keep_images=)"
         )
-    notes = [f"Left out, for no imagined frames of them are kept: {', '.join(map(repr, without))}."] if without else []
+    notes = [f"Left out, as no imagined frames of them were kept: {', '.join(map(repr, without))}."] if without else []
     return [arm for arm in found if arm.places], notes
 
 
 def _name_runs(logs: Sequence[RunLog]) -> list[str]:
-    """Return the names of the runs' folders, or their whole paths where two have one name."""
+    """Return the names of the runs' folders, or their full paths if two share a name."""
     paths = [log.path.resolve() for log in logs]
     if len(set(paths)) < len(paths):
         raise ArgumentError(f"quality: expected different runs, got {', '.join(map(str, paths))}; name each once")
@@ -237,8 +242,8 @@ def _choose_frames(arms: Sequence[_Arm], count: int) -> list[FrameKey]:
     if not keys:
         counts = ", ".join(f"{arm.label} {len(arm.places)}" for arm in arms)
         raise ArgumentError(
-            f"quality: expected frames that all arms have imagined from the same place for the same plan, got none in "
-            f"common ({counts}); compare arms of one policy and one kind of view with arms= or --arms"
+            "quality: expected frames that all arms have imagined from the same place for the same plan, got none in "
+            f"common ({counts}); choose arms with the same policy and kind of view with arms= or --arms"
         )
     return sample_frames(keys, count)
 
@@ -274,7 +279,7 @@ def _score_all(
             taken = {name for one in cards for name in one["scores"]} | {CONTROL_BY_LPIPS, CONTROL_BY_SSIM, "q"}
             if both := sorted(taken & set(card.scores)):
                 raise ArgumentError(
-                    f"quality: scorer '{spec}' gives {both[0]}, a name that is taken; let it give the score another one"
+                    f"quality: scorer '{spec}' gives {both[0]}, a name that is already taken; rename its score"
                 )
             cards.append({**card.as_dict(), "command": spec})
             _score(scorer, spec, arms, stores, scoring)
@@ -311,14 +316,14 @@ def _score(
 
 
 def _ask(scorer: Scorer, images: Mapping[str, Image]) -> Iterator[tuple[str, dict[str, float]]]:
-    """Yield the scores of images by digest; they lie in a folder as PNG files meanwhile."""
+    """Yield the scores of images by digest; meanwhile the images are PNG files in a folder."""
     with tempfile.TemporaryDirectory(prefix="wiw-quality-") as folder:
         paths = {Path(folder) / f"{digest[:32]}.png": digest for digest in images}
         for path, digest in paths.items():
             if not cv2.imwrite(str(path), cv2.cvtColor(images[digest], cv2.COLOR_RGB2BGR)):
                 raise FileError(
-                    f"{path}: cannot be written; expected free space for {len(paths)} frames among temporary "
-                    "files: make room, or name another folder by the environment variable TMPDIR"
+                    f"{path}: cannot be written; expected room for {len(paths)} frames in the temporary folder: free "
+                    "some space, or choose another folder with the environment variable TMPDIR"
                 )
         for path, scores in scorer.score(list(paths)):
             yield paths[path], scores
@@ -340,12 +345,12 @@ def _ask_actors(
 
 
 class BatchScorer:
-    """A scorer in an actor; one is made for each batch, for a command answers one list of images.
+    """A scorer in an actor; a new one is created for each batch, as a command answers only one list of images.
 
     Args:
-        spec: of the scorer, as `make_scorer` takes it.
+        spec: the scorer, as for `make_scorer`.
         deadline: seconds that it may be silent.
-        card: of the scorer that has the same name where the scores are stored.
+        card: card of the scorer of that name where the scores are stored.
     """
 
     def __init__(self, spec: str, deadline: float, card: ScorerCard) -> None:
@@ -355,7 +360,7 @@ class BatchScorer:
         """Return {"digest": [B], "scores": [B], as JSON} of {"digest": [B], "shape": [B, 3], "pixels": [B]}.
 
         Raises:
-            ScorerError: no valid scores, or the scorer here is another version.
+            ScorerError: no valid scores, or the scorer here has a different version.
         """
         rows = zip(batch["digest"], batch["pixels"], batch["shape"], strict=True)
         images = {str(digest): np.frombuffer(data, np.uint8).reshape(shape) for digest, data, shape in rows}
@@ -363,7 +368,7 @@ class BatchScorer:
             if scorer.card.digest != self._card.digest:
                 raise ScorerError(
                     f"scorer '{self._spec}' is {scorer.card.label} on a machine of the cluster, expected "
-                    f"{self._card.label} as here; install the same on all"
+                    f"{self._card.label} as here; install the same one everywhere"
                 )
             found = dict(_ask(scorer, images))
         return {"digest": list(found), "scores": [json.dumps(scores) for scores in found.values()]}
@@ -372,7 +377,7 @@ class BatchScorer:
 def _compare_with_truth(
     arms: Sequence[_Arm], stores: Mapping[Path, FrameScores], lpips: Lpips | None, watch: Watch | None
 ) -> None:
-    """Add controllability: SSIM, and 1 - LPIPS where its weights are, of each frame against the true one."""
+    """Add controllability of each frame against the true one: SSIM, and 1 - LPIPS if its weights are available."""
     measures: dict[str, Callable[[Image, Image], float]] = {CONTROL_BY_SSIM: _measure_similarity}
     if lpips is not None:
         measures = {CONTROL_BY_LPIPS: lambda a, b: 1 - _measure_distance(lpips, a, b), **measures}
@@ -391,13 +396,13 @@ def _is_panorama(frame: Image) -> bool:
 
 
 def _measure_similarity(frame: Image, true: Image) -> float:
-    """Return SSIM, of panoramas weighted by latitude."""
+    """Return SSIM, weighted by latitude for panoramas."""
     found = ssim(frame, true, weights="latitude" if _is_panorama(frame) else "uniform")
     return min(1.0, float(np.asarray(found)))  # rounding of the weights
 
 
 def _measure_distance(lpips: Lpips, frame: Image, true: Image) -> float:
-    """Return LPIPS; it knows no sphere, so of panoramas the mean over front, left, right and back."""
+    """Return LPIPS; as it is not defined on a sphere, for panoramas the mean over front, left, right and back views."""
     if not _is_panorama(frame):
         return float(np.asarray(lpips(frame, true)))
     views = [
@@ -410,7 +415,7 @@ def _measure_distance(lpips: Lpips, frame: Image, true: Image) -> float:
 def _compare_arm(
     arm: _Arm, store: FrameScores, card: ScorerCard, name: str, measure: Callable[[Image, Image], float]
 ) -> dict[FrameKey, float]:
-    """Return a measure of an arm's frames against the true ones, where these are known."""
+    """Return a measure of an arm's frames against the true ones, if these are known."""
     pairs = {key: f"{digest}:{digest_frame(arm.true[key])}" for key, digest in arm.digests.items() if key in arm.true}
     store.add_scorer(card.digest, card.as_dict(), name)
     known = store.read(card.digest, pairs.values())
@@ -451,8 +456,8 @@ def _read_outcomes(arms: Sequence[_Arm]) -> tuple[Metric, dict[str, dict[int, fl
         if set.intersection(*map(set, values.values())):
             return metric, values
     raise ArgumentError(
-        f"quality: expected episodes that are scored in all of {', '.join(done)}, got none; let the run go on "
-        "(`wiw resume`), or name other arms"
+        f"quality: expected episodes that are scored in all of {', '.join(done)}, got none; continue the run (`wiw "
+        "resume`), or choose other arms"
     )
 
 
@@ -469,7 +474,7 @@ def _average_by_episode(scores: Mapping[FrameKey, float]) -> dict[int, float]:
 
 
 def _choose_pictures(arms: Sequence[_Arm], keys: Sequence[FrameKey]) -> dict[str, list[Image]]:
-    """Return the first frames of the sample, the same of each arm, and the true ones where all are known."""
+    """Return the first frames of the sample, the same for each arm, and the true ones if all are known."""
     shown = list(keys[:SHOWN])
     pictures = {arm.label: [arm.frames[key] for key in shown] for arm in arms}
     true = next((arm.true for arm in arms if all(key in arm.true for key in shown)), None)

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""A run as a researcher reads it: summary, table, costs, fidelity, attribution, report."""
+"""A run from a researcher's view: summary, table, costs, fidelity, blame, report."""
 
 from __future__ import annotations
 
@@ -17,11 +17,11 @@ from wiw.runs.store import RunStore
 
 
 class RunLog(Run):
-    """A run on disk, finished or not. Made by `wiw.evaluate` and `wiw.load_run`."""
+    """A run on disk, finished or not, as returned by `wiw.evaluate` and `wiw.load_run`."""
 
     @property
     def valid(self) -> bool:
-        """Whether every arm has ended every episode and at most 1 % of them ended with an infrastructure error."""
+        """Whether every arm has finished every episode, with at most 1 % infrastructure errors."""
         return self.complete and not self.numbers().invalid
 
     def numbers(self) -> SummaryTable:
@@ -44,23 +44,23 @@ class RunLog(Run):
         return Records(line.as_dict() for line in costs(self))
 
     def breakdown(self, name: str) -> Records:
-        """Return a further table as plain values: one dict per estimate, with value, low, high and n.
+        """Return another table as plain values: one dict per estimate, with value, low, high and n.
 
         Args:
             name: "kinds" (by kind of episode), "anytime" (scores if cut after so many primitives, or decisions),
-                "anytime_differences" (paired), or "twins"; empty where the task has no such table.
+                "anytime_differences" (paired), or "twins"; the result is empty if the task has no such table.
         """
         return Records(line for each in self.numbers().breakdowns if each.name == name for line in each.list_cells())
 
     def fidelity(self) -> Records:
-        """Return how true imagination was in each arm that was run with `fidelity=True`: one dict per arm.
+        """Return how faithful imagination was in each arm run with `fidelity=True`: one dict per arm.
 
         See `wiw.analysis.fidelity.ArmFidelity`; each decision's own figures are in `decisions`, column "fidelity".
         """
         return Records(line.as_dict() for line in fidelity(self))
 
     def blame(self) -> Records:
-        """Return the stages to blame for each arm's failures, as far as they were rerun: one dict per arm.
+        """Return the stages to blame for each arm's rerun failures: one dict per arm.
 
         See `wiw.analysis.blame.ArmBlame`.
         """
@@ -78,14 +78,14 @@ class RunLog(Run):
         """Write a self-contained HTML report and return its path.
 
         Args:
-            path: of the file; `report.html` in the run's folder if not given.
-            episodes: how many to show with pictures; all that kept them if not given.
-            max_mb: most megabytes of the file; pictures are made smaller, then episodes left out, until it fits.
+            path: file to write; by default `report.html` in the run's folder.
+            episodes: number of episodes to show with images; by default all that kept them.
+            max_mb: maximum file size in megabytes; images are shrunk, then episodes dropped, until it fits.
             remark: sentence that the page shows below the result.
 
         Raises:
             ArgumentError: a number out of range, or less than the tables and plots take.
-            FileError: the file cannot be written; what was there before is kept.
+            FileError: the file cannot be written; an older version is kept.
         """
         from wiw.report.page import write_report
 
@@ -93,7 +93,7 @@ class RunLog(Run):
         return write_report(self, file, episodes=episodes, max_mb=max_mb, remark=remark)
 
     def view(self, folder: str | Path | None = None) -> Path:
-        """Write pages to walk through all episodes and decisions; return the one to open, `view/index.html`."""
+        """Write pages for browsing all episodes and decisions; return the one to open, `view/index.html`."""
         from wiw.report.site import write_view
 
         return write_view(self, Path(folder) if folder is not None else self.path / "view").index
@@ -101,7 +101,7 @@ class RunLog(Run):
     def export(
         self, csv: str | Path | None = None, parquet: str | Path | None = None, rerun: str | Path | None = None
     ) -> list[Path]:
-        """Write tables into new folders, a recording for the Rerun viewer, or several of these; return the files."""
+        """Write tables into new folders, a recording for the Rerun viewer, or both; return the files."""
         from wiw.report.export import export
 
         return export(self, *(None if path is None else Path(path) for path in (csv, parquet, rerun)))
@@ -118,8 +118,8 @@ def load_run(path: str | Path, judge: str | None = None) -> RunLog:
         judge: name or digest of the judge whose marks are read (see `wiw.judge`); None for the run's own.
 
     Raises:
-        StoreError: nothing there, damaged, or of another version.
-        ArgumentError: no judge or several of that name.
+        StoreError: there is no run, or it is damaged or of another version.
+        ArgumentError: no judge, or several judges, of that name.
     """
     store = RunStore.read(path)
     try:

@@ -2,8 +2,8 @@
 """Inference-time scaling: does more imagination help, and what does it cost? (paper, "Inference-time scaling").
 
 One run with an arm for each amount of imagination, all on the same episodes. The amounts are nested: an agent with
-fewer candidates keeps the first of those that the largest one has, and what a smaller share of decisions consults the
-world model for, a larger one does too. A model behind the rollout cache is asked once for what several arms imagine.
+fewer candidates keeps the first of those of the largest one, and the decisions of a smaller share are among those of a
+larger one. With the rollout cache, a model computes only once what several arms imagine.
 """
 
 from __future__ import annotations
@@ -27,9 +27,9 @@ from wiw.studies.evaluate import run_arms
 from wiw.studies.run_log import RunLog
 
 EPISODES = 20
-"""Where neither the caller nor the config says how many."""
+"""Default number of episodes."""
 CANDIDATES = (1, 2, 4, 8)
-"""Values of the sweep by default."""
+"""Default values of the sweep."""
 
 
 @dataclass(frozen=True)
@@ -112,14 +112,15 @@ def scale(
     Args:
         env_or_task: an environment, a task, a `TaskRecipe`, or a task's name.
         agent: a `wiw.Agent` with a world model, or an `AgentRecipe`.
-        candidates: plans imagined at each decision; 1, 2, 4, 8 where this and `imagine_fraction` are None.
-        imagine_fraction: shares of decisions for which the model is consulted, with the agent's own candidates; 0 is
+        candidates: numbers of plans imagined at each decision; 1, 2, 4, 8 if this and `imagine_fraction` are None.
+        imagine_fraction: shares of decisions for which the model is consulted, with the agent's own candidates; 0 uses
             the proposer's own preference.
-        config: how the run goes; a folder as `cache` spares any model what several amounts imagine.
-        settings: any of `RunConfig`'s in place of the config's, and options of a task given by name.
+        config: settings of the run; with a folder as `cache`, any model computes only once what several amounts
+            imagine.
+        settings: settings of `RunConfig` that override the config's, and options of a task given by name.
 
     Raises:
-        ArgumentError: an agent without a world model; a shard; no amounts, equal ones or ones out of range.
+        ArgumentError: an agent without a world model, a shard, or amounts that are missing, repeated or out of range.
     """
     if agent.model is None:
         raise ArgumentError("scale: expected an agent with a world model, got one without")
@@ -128,8 +129,8 @@ def scale(
     own, task_options = take_settings(config, settings)
     if own.shard is not None:
         raise ArgumentError(
-            "scale: a curve needs all episodes, so it takes no shard; expected none, or `wiw run --shard` for each "
-            "number of candidates"
+            "scale: a curve needs all episodes, so --shard is not supported; use `wiw run --shard` for each number of "
+            "candidates instead"
         )
     out = own.out or Path("runs") / f"scale-{datetime.now():%Y%m%d-%H%M%S}"
     run_config = replace(own, out=out, keep_images=0, episodes=own.episodes or EPISODES)

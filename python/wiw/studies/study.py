@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Run what a study's file lists, and put its tables and figures on one page (`wiw.studies.study_file`)."""
+"""Run what a study's file lists, and show its tables and figures on one page (`wiw.studies.study_file`)."""
 
 from __future__ import annotations
 
@@ -26,12 +26,12 @@ from wiw.studies.run_log import RunLog
 from wiw.studies.study_file import StudyPlan, StudyRun, load_study
 
 FILE = "study.yaml"
-"""In a study's folder: the file with its variables filled in."""
+"""The study file with its variables filled in, in the study's folder."""
 
 
 @dataclass(frozen=True)
 class StudyPart:
-    """Outcome of one run of a study."""
+    """The outcome of one run of a study."""
 
     run: StudyRun
     log: RunLog
@@ -95,27 +95,27 @@ def study(
     workers: int = 1,
     progress: bool = True,
 ) -> Study:
-    """Run a study: the runs that its file lists, one after another, or what is missing of them.
+    """Run a study: execute the runs listed in its file one after another, or what is missing of them.
 
         found = wiw.study("front-vs-panorama", small=True)
         found.summary()
         found.save()                       # study.html, study.json and figures
 
-    A second call goes on where the first one stopped. The file may have gained runs and arms since, which are run
-    beside those that are there; anything else must be as it was. Rollouts of models that are cacheable and answers of
-    language models are kept, so that no run asks for what another has.
+    A second call continues where the first one stopped. Runs and arms that were added to the file since are run as
+    well; everything else must be unchanged. Rollouts of cacheable models and answers of language models are cached, so
+    that no run repeats what another has computed.
 
     Args:
-        name: of a shipped study (`wiw list studies`), or the path of a YAML file.
-        out: folder; runs/study-NAME if not given.
-        variables: values in place of the file's.
-        small: whether to take the file's small values.
-        workers: processes; results do not depend on it.
+        name: name of a built-in study (`wiw list studies`), or the path of a YAML file.
+        out: folder to write; by default runs/study-NAME.
+        variables: values that override the file's.
+        small: whether to use the file's small values.
+        workers: number of processes; results do not depend on it.
         progress: whether to show progress bars.
 
     Raises:
-        ArgumentError: no such study, or one that cannot be run; says where in the file.
-        StoreError: the folder holds runs of other settings, or with arms that are changed or left out now.
+        ArgumentError: no such study, or one that cannot be run; says where in the file the problem is.
+        StoreError: the folder holds runs with other settings, or with arms that have changed or are now left out.
     """
     plan = load_study(name, variables, small)
     folder = Path(out) if out is not None else Path("runs") / f"study-{Path(name).stem}"
@@ -134,7 +134,7 @@ def _write_plan(plan: StudyPlan, folder: Path) -> None:
 
 
 def _require(run: StudyRun) -> None:
-    """Check that a run can be begun, before any of them takes time.
+    """Check that a run can start, before spending time on any.
 
     Raises:
         Error: its task or its agents cannot be.
@@ -145,11 +145,13 @@ def _require(run: StudyRun) -> None:
         agent.describe()
         agent.require(task, count)
         if run.quality is not None and not agent.is_named:
-            raise ArgumentError(f"study: {run.name}: arm '{arm}' is no name; quality is measured of stored runs")
+            raise ArgumentError(
+                f"study: {run.name}: arm '{arm}' is not a name; quality can only be measured on stored runs"
+            )
 
 
 def _run(run: StudyRun, folder: Path, workers: int, progress: bool) -> StudyPart:
-    """Run one run, or what is left of it, and measure what the study asks of it."""
+    """Execute one run, or what is left of it, and measure what the study requires."""
     settings = replace(run.settings, out=folder / run.name, resume=True, workers=workers, progress=progress)
     log = run_arms(run.task, run.agents, more_arms=True, config=settings)
     imagined = {line.arm: line.calls.get("rows", 0.0) / line.episodes for line in costs(log) if line.episodes}

@@ -52,8 +52,6 @@ _OWN_SETTINGS = ("out", "resume", "progress", "workers", "shard")
 _QUALITY_KEYS = ("scorers", "frames", "lpips", "deadline")
 _VARIABLE = re.compile(r"\{(\w+)\}")
 
-Mappings = Mapping[str, Mapping[str, Any]]
-
 
 @dataclass(frozen=True)
 class StudyRun:
@@ -68,7 +66,7 @@ class StudyRun:
     """Arms, each with the one that it is compared with."""
     plots: tuple[str, ...] = ("success",)
     quality: Mapping[str, Any] | None = None
-    """Options of `wiw.quality`; None where it is not asked for."""
+    """Options of `wiw.quality`; None if it is not asked for."""
 
 
 @dataclass(frozen=True)
@@ -100,8 +98,8 @@ def find_study(study: str | Path) -> Path:
     known = list_studies()
     if str(study) not in known:
         raise ArgumentError(
-            f"study: no study '{study}'; there are {', '.join(known)}, or give the path of a .yaml file."
-            f"{did_you_mean(str(study), list(known))}"
+            f"study: no study '{study}'; choose from {', '.join(known)}, or give the path of a .yaml "
+            f"file.{did_you_mean(str(study), list(known))}"
         )
     return FOLDER / f"{study}.yaml"
 
@@ -120,7 +118,7 @@ def parse_variables(pairs: Sequence[str]) -> dict[str, Any]:
         try:
             found[name.strip()] = yaml.safe_load(value)
         except yaml.YAMLError as error:
-            raise ArgumentError(f"study: --set: {pair}: the value is no YAML ({error})") from None
+            raise ArgumentError(f"study: --set: {pair}: the value is not valid YAML ({error})") from None
     return found
 
 

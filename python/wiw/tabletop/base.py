@@ -43,7 +43,7 @@ PALETTE: Mapping[str, tuple[float, float, float]] = {
 DOWN = (np.pi, 0.0, 0.0)
 """Roll, pitch, yaw of a hand that points down."""
 REACH = ((0.02, -0.28), (0.32, 0.28))
-"""Least and greatest x and y of where things are put, within easy reach of the arm."""
+"""Minimum and maximum x and y of where things are put, within easy reach of the arm."""
 
 GRASP_OPENING = (0.02, 0.5)
 """Range of the gripper's opening that means it holds a wall: between closed on nothing and not closed."""
@@ -93,7 +93,7 @@ class TabletopTask(ABC):
         """Return an instruction for a target, in one of several wordings."""
 
     def parse_target(self, text: str) -> Any:
-        """Return the target of an instruction: the one colour that it names.
+        """Return the target of an instruction: its only colour word.
 
         Raises:
             ArgumentError: it names none, or several.
@@ -108,7 +108,7 @@ class TabletopTask(ABC):
         """Return the other targets that the same objects allow."""
 
     def find_remaining_target(self, observation: ArmObservation, target: Any) -> Any:
-        """Return what remains to be done of a target; None where nothing remains, or nothing helps."""
+        """Return what remains to be done of a target; None if nothing remains, or nothing helps."""
         return target
 
     @abstractmethod
@@ -124,8 +124,8 @@ class TabletopTask(ABC):
     def estimate_completion(self, front: NDArray[np.uint8], places: Mapping[str, Pose], target: Any) -> float:
         """Return how far a front view, uint8 [H, W, 3] of any size, shows a target as achieved, from 0 to 1.
 
-        The view may be imagined and blurred; partial progress lies in between. `places` are the objects' poses before
-        the plan whose end the view shows.
+        The view may be imagined and blurred; partial progress is in between. `places` are the objects' poses before the
+        plan whose end the view shows.
         """
 
 
@@ -153,7 +153,7 @@ def scatter_places(key: int, count: int, apart: float, tries: int = 1000) -> NDA
             found.append(place)
         if len(found) == count:
             return np.stack(found)
-    raise ArgumentError(f"scatter_places: expected room for {count} things {apart} m apart, there is for {len(found)}")
+    raise ArgumentError(f"scatter_places: expected room for {count} things {apart} m apart, got room for {len(found)}")
 
 
 def choose_names(key: int, names: Sequence[str], count: int) -> list[str]:

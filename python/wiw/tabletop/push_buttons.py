@@ -60,7 +60,7 @@ class PushButtons(TabletopTask):
     variations = 50
 
     def create_setup(self, seed: int, variation: int) -> TableSetup:
-        """Create the table; variation v asks for 1 + v mod 3 pushes."""
+        """Create the table; variation v requests 1 + v mod 3 pushes."""
         colours = choose_names(derive_key(seed, variation, 1), COLOURS, BUTTONS)
         places = scatter_places(derive_key(seed, variation, 2), BUTTONS, 0.13)
         asked = tuple(colours[: 1 + variation % BUTTONS])

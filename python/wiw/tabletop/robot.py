@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
 """The arm at the table: the project's own Panda, or one described by a URDF file.
 
-What a description leaves open is inferred: two links that slide on the same link are the fingers, and that link is the
-hand; the point between the finger tips is the link whose name says so (`TOOL_WORDS`).
+Whatever a description leaves open is inferred: two links that slide on the same link are the fingers, and that link is
+the hand; the point between the finger tips is the link whose name says so (`TOOL_WORDS`).
 """
 
 from __future__ import annotations
@@ -185,7 +185,7 @@ def _find_tool_link(description: Articulation, hand: str) -> str:
                 return name
     raise ArgumentError(
         f"robot {description.name}: expected a link between the finger tips, fixed to '{hand}' and with one of the "
-        f"words {', '.join(TOOL_WORDS)} in its name; name another by robot_tcp=LINK, among "
+        f"words {', '.join(TOOL_WORDS)} in its name; choose another with robot_tcp=LINK, from "
         f"{', '.join(description.links)}"
     )
 
@@ -206,5 +206,5 @@ def _check_frame(robot: Robot) -> None:
         raise ArgumentError(
             f"robot {description.name}: expected '{robot.tcp}' as a frame between the finger tips with z out of the "
             f"hand and the fingers moving along y; they move along {np.round(way, 3).tolist()} m, the hand's frame "
-            f"lies {behind:+.3f} m along z; name another by robot_tcp=LINK"
+            f"lies {behind:+.3f} m along z; choose another with robot_tcp=LINK"
         )

@@ -39,7 +39,7 @@ class SlideBlock(TabletopTask):
     variations = 4
 
     def create_setup(self, seed: int, variation: int) -> TableSetup:
-        """Create the table; variation v asks for colour v, the block is up to 2 cm off the middle and rotated."""
+        """Create the table; variation v requests colour v; the block is rotated, and up to 2 cm off the middle."""
         draws = core.uniform(derive_key(seed, variation, 1), 5)
         middle = np.array([0.17, 0.0]) + 0.03 * (draws[:2] - 0.5)
         start = middle + 0.03 * (draws[2:4] - 0.5)

@@ -15,7 +15,7 @@ class Table:
 
     Args:
         kind: the kind of task that judges it.
-        setup: what lies where, and the instruction.
+        setup: the objects' poses, and the instruction.
         backend: renderer, "auto", "cpu" or "gpu".
         robot: the arm; None means the project's own.
         task: name of the task that the goal is of.

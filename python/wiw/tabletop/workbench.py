@@ -112,7 +112,7 @@ CAMERAS: Mapping[str, Camera] = {
 
 @dataclass(frozen=True)
 class Move:
-    """How far the arm came on its way to a pose."""
+    """How far the arm got on its way to a pose."""
 
     free: float
     """Share of the straight path that is free of the table and within reach, from 0 to 1; the arm sets out on that
@@ -228,7 +228,7 @@ class Workbench:
 
     @property
     def _gripper(self) -> Gripper:
-        """The gripper; it has no state of its own."""
+        """The gripper; it has no state."""
         return self.robot.create_gripper(self._world, self._arm)
 
     @property

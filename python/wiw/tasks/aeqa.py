@@ -29,7 +29,7 @@ from wiw.tasks.navigation import NavigationTask
 from wiw.types import Episode, Goal, TableSpec, TextAnswer, Wording
 
 HALF_TURN = 8
-"""Most primitives of a turn: 22.5 degrees each, the shorter way round."""
+"""Maximum number of primitives of a turn: 22.5 degrees each, the shorter way round."""
 SEEN = 0.008
 """Steradians of a thing in view that count as having seen it: .3 % of a view with 105 degrees across."""
 
@@ -45,7 +45,7 @@ class AEQARules:
     horizon: int
     """L, actions per plan, where the turn that a plan begins with counts as one, whatever its angle."""
     execute: int
-    """Most primitives carried out before the next decision."""
+    """Maximum number of primitives carried out before the next decision."""
     confirm: Literal["next_view", "same_view", "none"]
     """When a final answer ends the episode: given again after the next segment, given again at once on the same view
     (nothing is carried out in between), or the first time."""
@@ -63,7 +63,7 @@ class AEQARules:
 class AEQA(NavigationTask):
     """Answer a question about a home, exploring it as far as needed.
 
-    What is asked, when an episode ends, and what is measured. `NavigationTask` documents the rest of the arguments.
+    Questions, when an episode ends, and metrics. `NavigationTask` documents the rest of the arguments.
 
     Args:
         judge: who marks answers, see `wiw.judging.make_judge`: "rules" marks typed questions by rules and all others
@@ -95,25 +95,25 @@ class AEQA(NavigationTask):
         self.attributes = NO_ATTRIBUTES if attributes is None else read_attributes(attributes)
         if attributes is not None and (self.episode_file or self.is_balanced):
             raise ArgumentError(
-                "aeqa: attributes=FILE says more of a scene that tells little, such as a house of meshes (scenes=...); "
-                "apartments tell everything, and episodes of a file are asked as they are"
+                "aeqa: attributes=FILE describes the objects of a scene that lacks such data, such as a house of "
+                "meshes (scenes=...); apartments need none, and episodes from a file are used as they are"
             )
 
     # -- what it says of itself ----------------------------------------------------------------------------------------
 
     @property
     def limit(self) -> int:
-        """Most primitives of an episode."""
+        """Maximum number of primitives of an episode."""
         return int(self.rules.actions)
 
     @property
     def budget(self) -> int:
-        """Most primitives of an episode."""
+        """Maximum number of primitives of an episode."""
         return self.limit
 
     @property
     def decisions(self) -> int:
-        """Decisions that an episode takes if each carries out as much as it may: what progress bars expect."""
+        """Number of decisions of an episode if each executes as much as it may: what progress bars expect."""
         return -(-self.limit // int(self.rules.execute))
 
     @property
@@ -191,8 +191,8 @@ class AEQA(NavigationTask):
     def generate_first(self, count: int) -> list[Episode]:
         """Return questions, from where the answer is not in view.
 
-        Of generated apartments each is asked in two at least, with different answers. A scene from a file stands alone:
-        its questions are unbalanced, and their episodes say so (`info["unbalanced"]`).
+        Of generated apartments each is asked in two at least, with different answers. A scene from a file is used
+        alone: its questions are unbalanced, and their episodes say so (`info["unbalanced"]`).
         """
         scenes = resolve(self.scenes)
         if not self.is_balanced:
@@ -272,7 +272,7 @@ class AEQA(NavigationTask):
 
     @classmethod
     def read_answers(cls, task: Mapping[str, Any], episode: Episode, outcome: Mapping[str, Any]) -> AnswerRecord | None:
-        """Return the answers of a stored outcome; None where it has none because something other than a judge broke.
+        """Return the answers of a stored outcome; None if it has none because something other than a judge broke.
 
         Raises:
             StoreError: the outcome lacks what its marks are computed from.
@@ -289,7 +289,7 @@ class AEQA(NavigationTask):
             record.require_whole()
         except (KeyError, TypeError) as error:
             place = f"outcome of {outcome['arm']} in episode {outcome['episode']}"
-            raise StoreError(f"{place}: no {error}; the run store was edited: bring back a copy of it") from error
+            raise StoreError(f"{place}: no {error}; the run store was edited: restore it from a backup") from error
         return record
 
     def _make_record(self, state: EpisodeState) -> AnswerRecord:
@@ -331,7 +331,7 @@ class AEQA(NavigationTask):
 
 
 def read_question(episode: Episode) -> Question:
-    """Return the question of an episode, with all that the agent is not told."""
+    """Return the question of an episode, including everything hidden from the agent."""
     return Question.from_info(episode.info["question"])
 
 

@@ -50,7 +50,7 @@ class AnswerRecord:
 
         Raises:
             KeyError: a metric is missing.
-            TypeError: one is no number, or an answer no text.
+            TypeError: one is not a number, or an answer is not text.
         """
         for name in ("path_length", "shortest", "primitives"):
             if not isinstance(self.measured[name], int | float):
@@ -88,7 +88,7 @@ class AnswerRecord:
     def describe(self, judgements: Mapping[str, Judgement]) -> dict[str, Any]:
         """Return the answers with what is known of their judgements, as the details of an outcome.
 
-        Where a judgement is missing, there are no metrics, and "measured" has what no mark changes.
+        Where a judgement is missing, there are no metrics, and "measured" has those that do not depend on marks.
         """
         whole = all(answer in judgements for answer in self.answers)
         judged = judgements.get(self.answer) if self.answer else None
@@ -150,8 +150,8 @@ def _read_judgement(info: Mapping[str, Any]) -> Judgement | None:
         return Judgement.from_info(info) if info else None
     except (TypeError, ArgumentError) as error:
         raise StoreError(
-            f"expected a judgement with a mark, got {dict(info)!r:.120} ({error}); the run store was edited: bring "
-            "back a copy of it"
+            f"expected a judgement with a mark, got {dict(info)!r:.120} ({error}); the run store was edited: restore "
+            "it from a backup"
         ) from error
 
 

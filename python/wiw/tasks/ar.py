@@ -52,10 +52,9 @@ class ARRules:
 
 
 class AR(NavigationTask):
-    """Say what the boxed thing is, moving where that helps; the policy has to answer.
+    """Recognise the boxed object, moving if that helps; the policy must give an answer.
 
-    What is to be recognised, when an episode ends, and what is measured. `NavigationTask` documents the rest of the
-    arguments.
+    Targets, when an episode ends, and metrics. `NavigationTask` documents the rest of the arguments.
 
     Args:
         categories: what targets are and answers are chosen from; None means the built-in list

@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
-"""`Task`: the interface that evaluation relies on, with defaults where a task need not say anything.
+"""`Task`: the interface that evaluation relies on, with defaults for everything optional.
 
-`docs/write-your-own-task.md` has the shortest one.
+`docs/write-your-own-task.md` shows a minimal one.
 """
 
 from __future__ import annotations
@@ -24,35 +24,35 @@ if TYPE_CHECKING:
 
 
 class Task(ABC):
-    """Episodes, the environment they are run in, and what reports say about them.
+    """Episodes, the environment they run in, and what reports say about them.
 
-    A task is pickled to worker processes, and built anew by its name and options when a run is resumed.
+    A task is pickled to worker processes, and rebuilt from its name and options when a run is resumed.
     """
 
     name: str
     """Name in tables and run folders."""
     seed: int = 0
-    """Seed of a run that is given none."""
+    """Default seed of a run."""
     space: str = PRIMITIVES
-    """Elements of plans: `wiw.types.PRIMITIVES`, `wiw.types.GRIPPER_POSES`, or a space of the task's own."""
+    """Kind of actions in plans: `wiw.types.PRIMITIVES`, `wiw.types.GRIPPER_POSES`, or the task's own space."""
     metrics: tuple[str, ...] = ("success",)
-    """Names of the metrics that the paper reports of it."""
+    """Names of the metrics that the paper reports for it."""
     default_policy: str | None = None
-    """Name of the policy that runs it where none is named."""
+    """Name of its default policy."""
     sensor_options: tuple[str, ...] = ()
     """Options of `wiw.make` that are the environment's, not the task's."""
     choices: tuple[str, ...] = ()
-    """Labels that answers are chosen from, where the task asks for any."""
+    """Labels that answers are chosen from, if the task requires one."""
     wording: Wording = Wording()
-    """How reports speak of its episodes."""
+    """The words that reports use for its episodes."""
     tables: TableSpec = TableSpec()
-    """Contents of the tables and plots of its runs."""
+    """What the tables and plots of its runs show."""
     preset: str = ""
     """Name of its preset, or the path of its file; empty for a task without presets."""
     preset_settings: Preset = Preset()
-    """All that its preset sets."""
+    """Everything that its preset sets."""
     has_guide: bool = False
-    """Whether its environments' `guide` tells what plans are truly worth, which `wiw blame` asks."""
+    """Whether its environments' `guide` gives the true value of plans, which `wiw blame` needs."""
 
     # -- what every task says ------------------------------------------------------------------------------------------
 
@@ -62,11 +62,15 @@ class Task(ABC):
 
     @abstractmethod
     def environment(self, depth: bool = False) -> Env:
-        """Return a new environment for the task's episodes; `depth` asks for it in the observations."""
+        """Return a new environment for the task's episodes, with or without `depth` in the observations.
+
+        If the task has `sensor_options`, it takes these, too. The loop passes one of them, `cameras=("wrist",)`, for an
+        agent that needs the view of a wrist camera.
+        """
 
     @abstractmethod
     def episodes(self, count: int) -> list[Episode]:
-        """Return the first `count` episodes, the same ones however many are asked for.
+        """Return the first `count` episodes; a larger `count` starts with the same ones.
 
         Raises:
             ArgumentError: there are fewer.
@@ -76,22 +80,22 @@ class Task(ABC):
 
     @property
     def defaults(self) -> dict[str, Any]:
-        """Numbers of the search where the agent leaves them open: the paper's candidates M, horizon L and execute."""
+        """Defaults for the search's parameters: the paper's candidates M, horizon L and execute."""
         return {"candidates": 3, "horizon": 5, "execute": 1}
 
     @property
     def policy_options(self) -> Mapping[str, Mapping[str, Any]]:
-        """Options that named policies are made with on this task, where a run gives no others."""
+        """Default options of named policies on this task."""
         return self.preset_settings.policies
 
     @property
     def model_options(self) -> Mapping[str, Mapping[str, Any]]:
-        """Options that named world models are made with on this task, where a run gives no others."""
+        """Default options of named world models on this task."""
         return self.preset_settings.models
 
     @property
     def departures(self) -> Mapping[str, Mapping[str, str]]:
-        """Reasons why its preset departs from the paper."""
+        """Reasons for which its preset departs from the paper."""
         return self.preset_settings.departures
 
     @property
@@ -101,7 +105,7 @@ class Task(ABC):
 
     @property
     def decisions(self) -> int:
-        """Decisions that an episode may take, as far as known beforehand: what progress bars expect."""
+        """Number of decisions in an episode as far as known beforehand, for progress bars."""
         return 20
 
     @property
@@ -110,17 +114,17 @@ class Task(ABC):
         return None
 
     def explain_episodes(self, episodes: Sequence[Episode]) -> list[str]:
-        """Return sentences that users of some generated episodes must know; default: none."""
+        """Return sentences that users of generated episodes must know. Default: none."""
         return []
 
     @property
     def file_header(self) -> dict[str, Any] | None:
-        """Header of a file of its episodes (`wiw episodes`); None where episodes are not kept in files."""
+        """Header of a file of its episodes (`wiw episodes`); None if episodes are not kept in files."""
         return None
 
     @staticmethod
     def make_portable(options: Mapping[str, Any]) -> dict[str, Any]:
-        """Return the task's options so that they mean the same in any folder and on resuming."""
+        """Return the task's options in a form that means the same in any folder and when resuming."""
         return dict(options)
 
     def episode(self, index: int) -> Episode:
@@ -130,7 +134,7 @@ class Task(ABC):
             ArgumentError: a negative number, or there are fewer.
         """
         if index < 0:
-            raise ArgumentError(f"expected an episode's number of at least 0, got {index}")
+            raise ArgumentError(f"expected an episode number of at least 0, got {index}")
         return self.episodes(index + 1)[index]
 
     def vector_environment(self, num_envs: int, depth: bool = False) -> gymnasium.vector.VectorEnv[Any, Any, Any]:
@@ -142,13 +146,13 @@ class Task(ABC):
         raise ArgumentError(f"task '{self.name}' has no vector environment; use several of `wiw.make`")
 
     def require(self, episodes: Iterable[Episode]) -> dict[str, dict[str, str]]:
-        """Check that all that episodes need is there, without loading any of it.
+        """Check that everything episodes need exists, without loading it.
 
         Returns:
-            For each scene, what it is used with, which must not change while a run goes on.
+            For each scene, what it is used with, which must not change during a run.
 
         Raises:
-            FileError: something is not there.
+            FileError: something is missing.
         """
         return {}
 
@@ -158,11 +162,11 @@ class Task(ABC):
 
     @classmethod
     def read_answers(cls, task: Mapping[str, Any], episode: Episode, outcome: Mapping[str, Any]) -> AnswerRecord | None:
-        """Return the answers of a stored outcome, so that they can be judged again; None where it has none.
+        """Return the answers of a stored outcome, so that they can be judged again; None if it has none.
 
         Args:
-            task: what the task of the run says of itself (`describe`).
-            episode: that ended.
+            task: the run's task as it describes itself (`describe`).
+            episode: the finished episode.
             outcome: row of the run store: "status", "metrics", "details".
         """
         return None

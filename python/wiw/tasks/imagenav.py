@@ -38,10 +38,11 @@ class ImageNavRules:
     execute: int
     """Primitives carried out per decision; negative: all but that many of the chosen plan, at least one."""
     radius: float
-    """Metres; the episode succeeds on entering this sphere around the goal's position. Where an episode file gives a
-    goal's radius, that one holds, unless the radius is given as an option of the task."""
+    """Metres; the episode succeeds on entering this sphere around the goal's position. A goal's radius from an episode
+    file takes precedence, unless the radius is given as an option of the task.
+    """
     checked: Literal["primitive", "decision"]
-    """Whether success is looked at after every primitive or only where a decision is due."""
+    """Whether success is checked after every primitive or only at decisions."""
     distance: Literal["euclidean", "geodesic"]
     spl: Literal["metres", "actions"]
     """SPL by path length (the paper's formula) or by number of primitives."""
@@ -136,7 +137,7 @@ class ImageNav(NavigationTask):
 
 
 def _find_shortest(state: EpisodeState) -> tuple[float, int]:
-    """Return metres and primitives of an ideal run, as the episode gives them; what it does not give is measured."""
+    """Return metres and primitives of an ideal run, as the episode gives them; missing values are measured."""
     episode = state.episode
     geodesic, ideal = episode.geodesic, episode.info.get("ideal_primitives")
     if np.isfinite(geodesic) and ideal is not None:
@@ -154,7 +155,7 @@ def read_goal_image(path: Path) -> NDArray[np.uint8]:
     """
     found = cv2.imread(str(path), cv2.IMREAD_COLOR)
     if found is None:
-        raise FileError(f"{path}: expected the picture of a goal, got none that can be read")
+        raise FileError(f"{path}: expected a goal image, got a file that cannot be read")
     height, width = found.shape[:2]
     if not 1.5 <= width / height <= 2.5:  # those of the loop have 576 x 1024 pixels
         raise FileError(f"{path}: expected a panorama, about twice as wide as high, got {height}x{width}")

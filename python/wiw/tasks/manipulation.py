@@ -52,7 +52,7 @@ class ManipulationRules:
 
 
 class Manipulation(ManipulationSpec, Task):
-    """Push buttons, slide a block, put a ring on a peg, stack cups; instructions in words, actions by gripper poses.
+    """Push buttons, slide a block, put a ring on a peg, stack cups; instructions in words, actions as gripper poses.
 
     Args:
         tasks: "all", or names of `TABLETOP_TASKS`; episodes take them in turn.
@@ -83,11 +83,11 @@ class Manipulation(ManipulationSpec, Task):
         **rules: Any,
     ) -> None:
         if robot_tcp and robot is None:
-            raise ArgumentError(f"robot_tcp: names a link of the file `robot`, which is not given; got '{robot_tcp}'")
+            raise ArgumentError(f"robot_tcp: names a link of `robot`, but no robot file is given; got '{robot_tcp}'")
         if walking := [name for name in rules if name in WALKING]:
             raise ArgumentError(
-                f"manipulation: {', '.join(walking)}: this is for tasks in which an agent walks; "
-                "tables are set by `tasks` and `seed`"
+                f"manipulation: {', '.join(walking)}: only for tasks in which an agent walks; tables are determined by "
+                "`tasks` and `seed`"
             )
         self.tasks, self.seed, self.backend = _parse_tasks(tasks), check_seed(seed), backend
         self.robot = load_panda() if robot is None else load_robot(robot, robot_tcp)
@@ -113,7 +113,7 @@ class Manipulation(ManipulationSpec, Task):
 
     @property
     def decisions(self) -> int:
-        """Decisions that an episode may take, where all that is planned for one is carried out."""
+        """Number of decisions of an episode, if each plan is executed in full."""
         execute = self.rules.execute
         return -(-self.rules.actions // (execute if execute > 0 else max(1, self.rules.horizon + execute)))
 
@@ -184,7 +184,7 @@ class Manipulation(ManipulationSpec, Task):
         return float(-len(self.plan_expert(table, bench)) or UNREACHABLE)
 
     def plan_expert(self, table: Table, bench: Workbench) -> NDArray[np.float64]:
-        """Return what is left to do as a bench stands, float64 [K, 7]; nothing where nothing helps."""
+        """Return the remaining poses from a bench's present state, float64 [K, 7]; nothing where nothing helps."""
         kind, setup = table.kind, table.setup
         places = bench.get_poses(setup.objects)
         front = bench.render_view(arm=False)["color"]

@@ -28,8 +28,8 @@ class NavigationTask(NavigationSpec, Task):
     """Base of the tasks in which an agent walks; a subclass says what its goal is and when it is reached.
 
     Args:
-        scenes: scene spec, e.g. "apartments:test:40", or the path of a mesh or SDF world; None: "apartments:val". Where
-            Habitat's navigation mesh lies beside it ("house.navmesh" for "house.glb"), that one is used.
+        scenes: scene spec, e.g. "apartments:test:40", or the path of a mesh or SDF world; None: "apartments:val". If
+            Habitat's navigation mesh is beside it ("house.navmesh" for "house.glb"), that one is used.
         seed: seed of the generated episodes and of the run.
         preset: "default", "paper", "official", or the path of a YAML file; `rules` overrides it field by field.
         episode_file: a JSON episode file to use instead of generating; habitat-lab's and World-in-World's are read too.
@@ -82,12 +82,12 @@ class NavigationTask(NavigationSpec, Task):
         idle = [name for name, value in generating.items() if value is not None]
         if file is not None and idle:
             raise ArgumentError(
-                f"{self.name}: {', '.join(idle)}: this is for generated episodes, and those of {file} are run as they "
+                f"{self.name}: {', '.join(idle)}: only for generated episodes, but those of {file} are run as they "
                 "are; leave it out, or the episode file"
             )
         if file is None and folder:
             raise ArgumentError(
-                f"{self.name}: scene_folder says where the scenes of an episode file are; give episode_file too, or "
+                f"{self.name}: scene_folder is where the scenes of an episode file are; also give episode_file, or "
                 "name the scenes (scenes=...)"
             )
 
@@ -100,7 +100,9 @@ class NavigationTask(NavigationSpec, Task):
 
     def generate_episodes(self, place: World, first: int, before: list[Episode]) -> list[Episode]:
         """Return a `block` of generated episodes of a scene, from its number `first` on, after those `before`."""
-        raise NotImplementedError(f"{type(self).__name__}: write generate_episodes, or generate_first for all scenes")
+        raise NotImplementedError(
+            f"{type(self).__name__}: implement generate_episodes, or generate_first for all scenes"
+        )
 
     # ------------------------------------------------------------------------------------------------------------------
 
@@ -137,7 +139,7 @@ class NavigationTask(NavigationSpec, Task):
 
     @property
     def episode_count(self) -> int | None:
-        """How many episodes there are; None where a single scene gives as many as are asked for."""
+        """How many episodes there are; None if a single scene gives as many as are requested."""
         if self.episode_file:
             return len(self._read_file())
         scenes = resolve(self.scenes)
@@ -206,8 +208,8 @@ class NavigationTask(NavigationSpec, Task):
             done = len(made) // self.block
             if not whole_scene and done >= len(scenes):
                 raise ArgumentError(
-                    f"{self.name}: asked for {count} episodes, but there are {len(made)}; "
-                    "name more scenes (apartments:SPLIT:N) or raise per_scene"
+                    f"{self.name}: {count} episodes were requested, but there are only {len(made)}; name more scenes "
+                    "(apartments:SPLIT:N) or increase per_scene"
                 )
             place = world(scenes[0] if whole_scene else scenes[done], self.backend)
             block = self.generate_episodes(place, self.block * done if whole_scene else 0, made)
@@ -218,8 +220,8 @@ class NavigationTask(NavigationSpec, Task):
         found = self._read_file()
         if len(found) < count:
             raise ArgumentError(
-                f"{self.name}: asked for {count} episodes, but {self.episode_file} has {len(found)}; "
-                "ask for fewer, or leave the number open to run all of them"
+                f"{self.name}: {count} episodes were requested, but {self.episode_file} has only {len(found)}; request "
+                "fewer, or omit the number to run all of them"
             )
         return found[:count]
 

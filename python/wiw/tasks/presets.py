@@ -31,7 +31,7 @@ from wiw.typed_values import read_values
 FOLDER = Path(__file__).parents[1] / "configs"
 DEFAULT, PAPER = "default", "paper"
 HEADER = ("base", "about", "policy", "generator", "policies", "models", "departures")
-"""Keys that are no rules."""
+"""Keys that are not rules."""
 CONCERNS = ("rules", "vlm", "models", "text models")
 """Whom a departure concerns: every run, runs with policy `vlm`, with a world model, with one that is told words."""
 
@@ -108,11 +108,11 @@ def find_owner(task: type) -> str:
 def load_rules(cls: type[Rules], task: str, preset: str | Path, overrides: Mapping[str, Any]) -> Rules:
     """Return the rules of a preset, by name or by the path of a YAML file, with `overrides` on top.
 
-    What neither says is the default of `cls`, so that a task of one's own needs no preset: for a task that ships none,
+    Anything that neither sets is the default of `cls`, so a user's task needs no preset: for a task that ships none,
     the default preset stands for these values.
 
     Raises:
-        ArgumentError: no such preset; a key that is no rule; a value of another type. Names the file or argument.
+        ArgumentError: no such preset; an unknown rule; a value of another type. Names the file or argument.
         FileError: the file cannot be read, or does not hold a mapping.
     """
     values: dict[str, Any] = {}
@@ -137,7 +137,7 @@ def _open_fields(cls: type) -> list[Field[Any]]:
 
 
 def _list_files(task: str, preset: str | Path) -> list[Path]:
-    """Return the files of a preset, what it is based on first."""
+    """Return the files of a preset, those it is based on first."""
     path = _find(task, preset)
     if path is None:
         return []
@@ -162,7 +162,7 @@ def _find(task: str, preset: str | Path) -> Path | None:
         return path.resolve()
     if not shipped and preset == DEFAULT:
         return None
-    there = f"there are {', '.join(shipped)}, or give" if shipped else "it ships none; give"
+    there = f"choose from {', '.join(shipped)}, or give" if shipped else "it has none of its own; give"
     raise ArgumentError(
         f"{task}: no preset '{preset}'; {there} the path of a .yaml file.{did_you_mean(str(preset), shipped)}"
     )
@@ -186,12 +186,12 @@ def _read_policy(content: Mapping[str, Any], path: Path) -> str | None:
 def _read_generator_rules(content: Mapping[str, Any], path: Path) -> Mapping[str, Any]:
     rules = content.get("generator", {})
     if not isinstance(rules, Mapping):
-        raise ArgumentError(f"{path}: generator: expected rules of generated episodes, `name: value`, got {rules!r}")
+        raise ArgumentError(f"{path}: generator: expected rules for generated episodes as `name: value`, got {rules!r}")
     return {str(name): value for name, value in rules.items()}
 
 
 def _read_options(content: Mapping[str, Any], section: str, path: Path) -> Options:
-    """Return a section with options of parts, from a file of its own where it names one."""
+    """Return a section with options of parts, from a separate file where it names one."""
     options = content.get(section, {})
     if isinstance(options, str):
         path = path.parent / options
@@ -214,7 +214,7 @@ def _read_departures(content: Mapping[str, Any], path: Path) -> Options:
     )
     if not fits:
         raise ArgumentError(
-            f"{path}: departures: expected reasons by whom they concern ({', '.join(CONCERNS)}), such as "
+            f"{path}: departures: expected reasons, grouped by whom they concern ({', '.join(CONCERNS)}), such as "
             f"`rules: {{decisions: why}}`, got {reasons!r}"
         )
     return dict(reasons)

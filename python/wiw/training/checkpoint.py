@@ -36,7 +36,7 @@ class ResumableTrainer:
 
 @dataclass(frozen=True)
 class TrainingState:
-    """How far a training has come."""
+    """The state of a training."""
 
     epochs: int
     """Epochs of the whole training."""
@@ -66,7 +66,7 @@ class Checkpoint:
         return cls(out.with_name(f"{out.name}.checkpoint"), identity)
 
     def load(self) -> TrainingState | None:
-        """Read the file; None where there is none.
+        """Read the file; None if there is none.
 
         Raises:
             ArgumentError: it belongs to another training.
@@ -84,8 +84,8 @@ class Checkpoint:
             raise FileError(f"{self.path}: damaged ({error}); delete it to start again") from error
         if identity != self._identity:
             raise ArgumentError(
-                f"{self.path} is the checkpoint of a training with other data or options; delete it to start again, "
-                "or resume with the same options"
+                f"{self.path} is the checkpoint of a training with different data or options; delete it to start "
+                "again, or resume with the same options"
             )
         return state
 

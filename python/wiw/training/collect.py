@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Collect demonstrations of manipulation tasks by experts that know where objects are, as training data.
+"""Collect demonstrations of manipulation tasks by experts that know all object poses, as training data.
 
 Each demonstration is a pure function of the seed, its task and its number, and a file gets its name once it is
-complete. An interrupted collection therefore resumes, and ends with the same files.
+complete. An interrupted collection can therefore be resumed, and ends with the same files.
 """
 
 from __future__ import annotations
@@ -38,13 +38,13 @@ def collect(
     progress: Progress | None = None,
     **asked: Any,
 ) -> Demonstrations:
-    """Let experts perform manipulation tasks and record what the cameras see; resume where it was interrupted.
+    """Let experts perform manipulation tasks and record what the cameras see; resume an interrupted collection.
 
     Args:
-        out: a new folder, or one that the same call began.
+        out: a new folder, or one that the same call started.
         tasks: "all", or names of `wiw.tabletop.tasks.TABLETOP_TASKS`.
         workers: number of processes; the files do not depend on it.
-        place: where they are: on this machine, or tasks on a Ray cluster whose machines all see the folder.
+        place: where they run: on this machine, or as tasks on a Ray cluster whose machines all see the folder.
         progress: called whenever a file is complete.
         **asked: episodes, seed, size, frames, format, depth, wrist, keep_failed, backend, as in
             `wiw.training.recording.Collection`.
@@ -52,7 +52,7 @@ def collect(
     Raises:
         BackendError: the requested renderer does not work here.
         DependencyError: pyarrow is not installed.
-        ArgumentError: an option is out of range, or the folder holds another collection.
+        ArgumentError: an option is out of range, or the folder holds a different collection.
         FileError: the folder cannot be written.
         InfrastructureError: an expert fails at one table after another, or a worker process has died.
     """
@@ -93,7 +93,7 @@ class _Job:
     collection: Collection
 
     def read_failed_count(self) -> int | None:
-        """Return the number of tables failed at, as the file says; None where the file is absent or damaged."""
+        """Return the number of tables failed at, as the file says; None if the file is absent or damaged."""
         try:
             return int(shards.Shard(self.path).facts["failed"])
         except FileError:

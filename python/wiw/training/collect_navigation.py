@@ -1,9 +1,9 @@
 # SPDX-License-Identifier: Apache-2.0
 """Collect a navigation dataset: posed panoramas with depth and actions along traversals of scenes, for post-training.
 
-Follows Algorithm 1 and the appendix on post-training data of the World-in-World paper. A scene's segments are
-functions of (scene, seed, pass, options); each is kept as it is recorded, and a file gets its name once it is complete,
-so that a collection killed at any moment resumes and ends with the same bytes.
+Follows Algorithm 1 and the appendix on post-training data of the World-in-World paper. A scene's segments are functions
+of (scene, seed, pass, options); each is stored as soon as it is recorded, and a file gets its name once it is complete,
+so that a collection killed at any moment can be resumed and ends with the same bytes.
 """
 
 from __future__ import annotations
@@ -65,17 +65,17 @@ def collect_navigation(
     progress: Progress | None = None,
     **asked: Any,
 ) -> NavigationData:
-    """Record what an agent sees on traversals of scenes; resume where it was interrupted.
+    """Record what an agent sees on traversals of scenes; resume an interrupted collection.
 
     Args:
-        out: a new folder, or one that the same call began.
+        out: a new folder, or one that the same call started.
         scenes: scene specs of train splits: "apartments:train:80", or files of meshes and worlds.
         preset: "default", or "paper" (waypoints within 3 m count as visited).
         rules: fields of `wiw.training.navigation_rules.NavigationRules` to replace.
         workers: number of processes; the files do not depend on it.
-        place: where they are: on this machine, or tasks on a Ray cluster whose machines all see the folder.
-        skip_errors: whether scenes that cannot be opened are left out; otherwise they are an error, once all others
-            are recorded.
+        place: where they run: on this machine, or as tasks on a Ray cluster whose machines all see the folder.
+        skip_errors: whether to skip scenes that cannot be opened; otherwise they are an error, once all others are
+            recorded.
         progress: called whenever a pass over a scene is finished.
         **asked: passes, seed, perspective, size, height, depth, lossless, backend, as in
             `wiw.training.navigation_recording.NavigationCollection`.
@@ -83,7 +83,7 @@ def collect_navigation(
     Raises:
         BackendError: the requested renderer does not work here.
         DependencyError: pyarrow is not installed.
-        ArgumentError: an option is out of range, a scene is of a val or test split, or the folder holds another
+        ArgumentError: an option is out of range, a scene is of a val or test split, or the folder holds a different
             collection.
         FileError: a scene is missing, or the folder cannot be written.
         InfrastructureError: scenes cannot be opened, or a worker process has died.
@@ -108,7 +108,7 @@ def collect_navigation(
         raise InfrastructureError(
             f"collect: {len(errors)} of {len(specs)} scenes cannot be recorded, the others are: "
             + "; ".join(f"{scene}: {error}" for scene, error in errors.items())
-            + ". Mend them and repeat the command, or leave them out with --skip-errors"
+            + ". Fix them and repeat the command, or skip them with --skip-errors"
         )
     if len(finished) < len(jobs) or not (folder / META).exists():
         _finish(folder, config, options, [records[number] for number in sorted(records)], errors)
@@ -141,7 +141,7 @@ def resolve_train_scenes(scenes: str | PathLike[str] | Sequence[str | PathLike[s
 
     Raises:
         ArgumentError: a scene is of a split that is for evaluation, or two scenes have one name.
-        FileError: there is no such file.
+        FileError: the file does not exist.
     """
     given = [scenes] if isinstance(scenes, str | PathLike) else list(scenes)
     names: dict[str, str] = {}
@@ -162,8 +162,8 @@ def _check_train_split(spec: str) -> None:
     """Refuse scenes on which world models are evaluated."""
     if (split := find_evaluation_split(spec)) is not None:
         raise ArgumentError(
-            f"collect: expected scenes of a train split, got {spec}, which is of {split}: evaluation runs there; a "
-            "model trained on it would be tested on what it has seen. Name train scenes, such as apartments:train:80"
+            f"collect: expected scenes of a train split, got {spec}, which is of {split}: a model trained on scenes "
+            "used for evaluation would be tested on what it has seen. Choose train scenes, such as apartments:train:80"
         )
 
 
@@ -183,7 +183,7 @@ class SceneJob:
     options: NavigationCollection
 
     def read_record(self) -> dict[str, Any] | None:
-        """Return what is known about the finished pass; None where it is not finished or its files are not whole."""
+        """Return what is known about the finished pass; None if it is not finished or its files are not whole."""
         try:
             record: dict[str, Any] = json.loads(self._record_path.read_text())
             sizes = [(self.folder / name).stat().st_size == file["bytes"] for name, file in record["files"].items()]

@@ -27,10 +27,10 @@ def calibrate(views: LabelledViews, seed: int, steps: int = STEPS) -> ColorNamer
     """Train a namer on the pixels of the views' instances.
 
     Raises:
-        ArgumentError: the views show nothing of a known colour.
+        ArgumentError: the views have no object of a known colour.
     """
     if not len(views.pixels):
-        raise ArgumentError("expected scenes with things of known colours, got none; name others (--scenes)")
+        raise ArgumentError("expected scenes with objects of known colours, got none; choose others (--scenes)")
     features = compute_features(views.pixels)
     shift, scale = features.mean(axis=0), 1 / (features.std(axis=0) + 1e-3)
     inputs = torch.from_numpy(((features - shift) * scale).astype(np.float32))
@@ -69,7 +69,7 @@ def evaluate(namer: ColorNamer, views: LabelledViews) -> dict[str, Any]:
 
     Returns:
         {"things": N, "accuracy": of things in rooms, "structure": of walls, floors and the like, "by_category",
-        "by_color"}: shares of the sets of pixels whose colour was named as the scene names it, None where there are
+        "by_color"}: shares of the sets of pixels whose colour was named as the scene names it, None if there are
         none.
     """
     if not len(views.pixels):

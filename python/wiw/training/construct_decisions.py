@@ -30,7 +30,7 @@ SMALL = 144
 
 @dataclass(frozen=True)
 class DecisionRules:
-    """How decisions are constructed. Lengths in metres.
+    """Rules for constructing decisions. Lengths in metres.
 
     Raises:
         ArgumentError: a number is out of range.
@@ -39,9 +39,9 @@ class DecisionRules:
     plans: int = 6
     """Plans of a decision."""
     actions: int = 13
-    """Most actions of a plan: those of a clip of 14 frames."""
+    """Maximum number of actions in a plan: those of a clip of 14 frames."""
     least_steps: int = 2
-    """Least steps ahead of a plan."""
+    """Minimum number of steps ahead in a plan."""
     goal_shortest: float = 0.8
     goal_longest: float = 2.2
     size: tuple[int, int] = (64, 128)
@@ -50,11 +50,14 @@ class DecisionRules:
     def __post_init__(self) -> None:
         if not 2 <= self.plans <= HEADINGS or self.least_steps < 1 or self.actions < HEADINGS // 2 + self.least_steps:
             raise ArgumentError(
-                f"decisions: expected 2 to {HEADINGS} plans, least_steps of 1 or more, and {HEADINGS // 2} actions "
-                f"more than that, for turns to any heading; got {self}"
+                f"decisions: expected 2 to {HEADINGS} plans, least_steps of 1 or more, and at least "
+                f"{HEADINGS // 2} actions more than least_steps, so that any heading can be turned to; got {self}"
             )
         if not 0 < self.goal_shortest < self.goal_longest or min(self.size) < 16:
-            raise ArgumentError(f"decisions: expected goals from above 0 m on and pictures of 16 rows, got {self}")
+            raise ArgumentError(
+                "decisions: expected 0 < goal_shortest < goal_longest, and panoramas of at least 16 rows and columns, "
+                f"got {self}"
+            )
 
 
 def collect_decisions(
@@ -68,14 +71,14 @@ def collect_decisions(
 
     Args:
         specs: the scenes, such as "apartments:val:20".
-        per_scene: decisions of each; fewer where there is not so much room.
+        per_scene: decisions of each; fewer where there is not enough room.
         seed: with scenes and rules, it determines the decisions.
         rules: see `DecisionRules`.
         progress: called after each scene with its name, and how many of how many are done.
 
     Raises:
         ArgumentError: nowhere is there room, or `per_scene` is below 1.
-        FileError: there is no such scene.
+        FileError: the scene does not exist.
     """
     if per_scene < 1:
         raise ArgumentError(f"decisions: expected per_scene of at least 1, got {per_scene}")
@@ -84,9 +87,7 @@ def collect_decisions(
         parts.append(construct_decisions(world(name), per_scene, seed, rules))
         progress(name, done, len(names))
     if not any(map(len, parts)):
-        raise ArgumentError(
-            f"decisions: {specs} has no place from where {rules.plans} ways are free; name other scenes"
-        )
+        raise ArgumentError(f"decisions: {specs} has no place with {rules.plans} free directions; choose other scenes")
     return join_decisions([part for part in parts if len(part)])
 
 
@@ -108,7 +109,7 @@ class _Decision:
 
 
 def _construct(world: World, path: StraightPath, draws: np.random.Generator, rules: DecisionRules) -> _Decision | None:
-    """Return plans and places of a decision towards the end of a path; None where too few ways are free."""
+    """Return plans and places of a decision towards the end of a path; None if too few paths are free."""
     length = draws.uniform(rules.goal_shortest, max(path.length, rules.goal_shortest))
     yaw = path.heading + draws.uniform(0, 2 * np.pi)
     turns = draws.permutation(np.arange(-HEADINGS // 2 + 1, HEADINGS // 2 + 1))

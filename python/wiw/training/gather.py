@@ -93,7 +93,7 @@ def gather_glimpse_sets(
 
     Raises:
         FileError: the folder cannot be written.
-        ArgumentError: the scenes show nothing of `categories`.
+        ArgumentError: the scenes have no object of `categories`.
     """
     make = partial(_build_glimpse_sets, seed=seed, categories=tuple(categories), rules=rules)
     job = Job(f"glimpses in {specs}", GLIMPSE_SET_FIELDS, make, (2, list(categories), seed, asdict(rules)))
@@ -239,8 +239,8 @@ def gather_arrays(sources: Mapping[str, str], job: Job, folder: Path, workers: i
 def _require_arrays(arrays: Arrays | None, file: Path, job: Job) -> Arrays:
     if arrays is None:
         raise FileError(
-            f"{job.name}: {file} was written and cannot be read back; is something else deleting or writing files "
-            "there? Repeat the command, or choose another folder by --cache"
+            f"{job.name}: {file} was written but cannot be read back; is something else deleting or writing files "
+            "there? Repeat the command, or choose another folder with --cache"
         )
     return arrays
 
@@ -267,7 +267,7 @@ class _FileJob:
 
 
 def _read_file(file: Path, job: Job) -> Arrays | None:
-    """Return the arrays of a cache file; None where it is absent or incomplete."""
+    """Return the arrays of a cache file; None if it is absent or incomplete."""
     try:
         with np.load(file) as values:
             return {name: values[name] for name in job.fields}

@@ -34,16 +34,16 @@ WAY_SHARES = np.array([0.0, 0.4, 0.7, 1.0])
 
 @dataclass(frozen=True)
 class GlimpseSetRules:
-    """How a scene is sampled. Lengths in metres."""
+    """Rules for sampling a scene. Lengths in metres."""
 
     places: int = 8
     targets: int = 5
-    """Most objects observed from a place; those of rare categories come first."""
+    """Maximum number of objects observed from a place; those of rare categories come first."""
     neighbours: int = 3
     reach: tuple[float, float] = (0.25, 1.6)
-    """Least and greatest distance of the neighbours; the second is the length of eight steps."""
+    """Minimum and maximum distance of the neighbours; the second is the length of eight steps."""
     smallest: float = 0.0015
-    """Least solid angle of a target in steradians, 45 pixels of the panorama."""
+    """Minimum solid angle of a target in steradians, 45 pixels of the panorama."""
     survey: int = 150
     """Number of candidate places."""
     reshape: float = 1.25
@@ -79,7 +79,7 @@ def merge_glimpse_sets(parts: Sequence[GlimpseSets]) -> GlimpseSets:
         ArgumentError: there is not one set in them.
     """
     if not sum(len(part) for part in parts):
-        raise ArgumentError("expected scenes that show things of the categories, got none; name others (--scenes)")
+        raise ArgumentError("expected scenes with objects of the categories, got none; choose others (--scenes)")
     return join_glimpse_sets(parts)
 
 

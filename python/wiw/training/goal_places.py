@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Training data of the navigator: places of a scene as seen, and the ways between them.
+"""Training data of the navigator: places of a scene as seen, and the paths between them.
 
 A goal view is a part of the panorama at the goal, so any two places of a scene are an example, at any heading.
 """
@@ -26,7 +26,7 @@ AHEAD = 1.0
 TRIES = 8
 """Candidates for each place near another."""
 DEPTH_ROWS = slice(12, 52)
-"""Rows of a 64-row panorama whose median depth tells how far one sees in a column."""
+"""Rows of a 64-row panorama whose median depth is how far one sees in a column."""
 SIGHT_MARGIN = 0.3
 """Metres in front of a place where what is seen hides it no longer."""
 
@@ -38,7 +38,7 @@ class PlaceRules:
     anchors: int = 24
     """Places all over the scene."""
     neighbours: int = 3
-    """Most places near each of those."""
+    """Maximum number of places near each of these."""
     reach: float = 2.0
     """Greatest distance of the near ones."""
 
@@ -52,7 +52,7 @@ class GoalPlaces:
     depths: NDArray[np.float16]
     """float16 [N, 128]: median metres seen in each column."""
     distances: NDArray[np.float16]
-    """float16 [N, N]: metres of the shortest path from place i to place j, inf where there is none."""
+    """float16 [N, N]: metres of the shortest path from place i to place j, inf if there is none."""
     bearings: NDArray[np.float16]
     """float16 [N, N]: azimuth at place i of the path to place j a metre on, in radians, left positive; 0 where none."""
     visible: NDArray[np.bool_]
@@ -122,5 +122,7 @@ def require_places(parts: Sequence[GoalPlaces]) -> Sequence[GoalPlaces]:
     """
     usable = [part for part in parts if np.isfinite(part.distances).sum() > len(part)]  # each is 0 m from itself
     if not usable:
-        raise ArgumentError("expected scenes in which one can walk from a place to another, got none; name others")
+        raise ArgumentError(
+            "expected scenes in which an agent can walk from one place to another, got none; choose others"
+        )
     return usable

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""How near imagined frames are to the true ones of held-out clips, and whether they follow the actions.
+"""Measure how close imagined frames are to the true ones of held-out clips, and whether they follow the actions.
 
 The *control gap* is the error under the actions of another clip less the error under the true ones. Which frames count,
 how they are compared and what is imagined under other actions differs between the kinds of clips: panoramas
@@ -93,7 +93,7 @@ class HeldOutClips(ABC, Generic[Errors]):
     plans: NDArray[Any]
     """[N, ...]: the actions, as `Imagine` takes them."""
     shuffled: NDArray[Any]
-    """[N, ...]: the actions of another clip; the same in another order where there is one clip alone."""
+    """[N, ...]: the actions of another clip; the same in another order if there is one clip alone."""
     steps: tuple[int, ...]
     """[S]: numbers of actions, ascending, at most those of a plan."""
 
@@ -102,7 +102,7 @@ class HeldOutClips(ABC, Generic[Errors]):
 
     @property
     def view(self) -> ShownView | None:
-        """View in which models of such clips see stored decisions; None where no agent moves."""
+        """View in which models of such clips see stored decisions; None if no agent moves."""
         return None
 
     def observe(self, rows: slice) -> Conditioning:
@@ -115,7 +115,7 @@ class HeldOutClips(ABC, Generic[Errors]):
 
 
 def take_mean(values: NDArray[Any], chosen: NDArray[np.bool_]) -> float:
-    """Return the mean of the chosen values; NaN where there are none."""
+    """Return the mean of the chosen values; NaN if there are none."""
     return float(values[chosen].mean()) if chosen.any() else math.nan
 
 
@@ -146,7 +146,7 @@ def fit_steps(steps: Sequence[int], actions: int) -> tuple[int, ...]:
     """Return the numbers of actions that clips of so many actions have; the last one in place of larger ones.
 
     Raises:
-        ArgumentError: there are no actions.
+        ArgumentError: clips without actions.
     """
     if actions < 1:
         raise ArgumentError("expected clips of at least 2 frames, got 1")

@@ -61,7 +61,7 @@ def run_jobs(jobs: Sequence[Job[Result]], workers: int, place: Engine = HERE) ->
             yield running[each], each.result()
     except BrokenProcessPool as error:
         raise InfrastructureError(
-            "a worker process died, perhaps for lack of memory; run the same again, with fewer workers"
+            "a worker process died, perhaps out of memory; repeat the command with fewer workers"
         ) from error
     finally:
         pool.shutdown(wait=False, cancel_futures=True)
@@ -91,8 +91,8 @@ def open_folder(folder: Path, config: Mapping[str, Any], read: Callable[[Path], 
 
     Args:
         folder: of the collection.
-        config: what is asked for; JSON-able.
-        read: reads the manifest of a folder; raises FileError where there is none.
+        config: what is requested; JSON-able.
+        read: reads the manifest of a folder; raises FileError if there is none.
 
     Raises:
         FileError: the folder cannot be written, or holds something else.
@@ -106,10 +106,12 @@ def open_folder(folder: Path, config: Mapping[str, Any], read: Callable[[Path], 
                 draft.write_text(json.dumps(config, indent=2) + "\n")
     except OSError as error:
         raise FileError(
-            f"{folder}: cannot be written ({error.strerror}); expected a folder with free space and the right to "
-            "write: make room or name another with --out"
+            f"{folder}: cannot be written ({error.strerror}); expected a writable folder with free space: make room, "
+            "or choose another with --out"
         ) from error
     before = read(folder)
     if differing := [name for name in {**config, **before} if before.get(name) != config.get(name)]:
-        said = ", ".join(f"{name} {before.get(name)} there and {config.get(name)} asked" for name in differing)
-        raise ArgumentError(f"{folder} holds another collection: {said}; ask for the same, or name another with --out")
+        said = ", ".join(f"{name} was {before.get(name)}, now {config.get(name)}" for name in differing)
+        raise ArgumentError(
+            f"{folder} holds a different collection: {said}; repeat the same command, or choose another with --out"
+        )

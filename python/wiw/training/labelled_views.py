@@ -32,7 +32,7 @@ is open, so that the network learns to look at how much of the window shows.
 COLOR_SAMPLES = 64
 """Pixels stored of an instance in a view, for learning colour names."""
 CLOSE = (0.7, 2.2)
-"""Least and greatest horizontal distance in metres of a close place from the middle of its thing."""
+"""Minimum and maximum horizontal distance in metres of a close place from the middle of its thing."""
 CANDIDATES = 2000
 """Places from which close ones are chosen."""
 LEAST_PIXELS = 150
@@ -45,7 +45,7 @@ COLORLESS = ("mirror", "picture", "photo", "window", "opening", "")
 
 @dataclass(frozen=True)
 class ViewRules:
-    """How a scene is sampled."""
+    """Rules for sampling a scene."""
 
     places: int = 12
     close: float = 0.5
@@ -55,7 +55,7 @@ class ViewRules:
     views: int = 3
     """Views of a place, in directions spread evenly around it."""
     fields: tuple[float, float] = (90.0, 110.0)
-    """Least and greatest horizontal field of view in degrees."""
+    """Minimum and maximum horizontal field of view in degrees."""
 
 
 @dataclass(frozen=True)
@@ -93,7 +93,7 @@ def merge_views(parts: Sequence[LabelledViews]) -> LabelledViews:
         ArgumentError: there is not one view in them.
     """
     if not sum(map(len, parts)):
-        raise ArgumentError("expected scenes in which one can stand, got none; name others (--scenes)")
+        raise ArgumentError("expected scenes with walkable floor, got none; choose others (--scenes)")
     return LabelledViews(*(np.concatenate([getattr(part, name) for part in parts]) for name in FIELDS))
 
 

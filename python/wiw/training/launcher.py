@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Start a training on several GPUs: of this machine through torchrun, of several through torchrun in a SLURM job.
+"""Start a training on several GPUs: on this machine with torchrun, on several machines with torchrun in a SLURM job.
 
-Each process runs the same command. torchrun tells it by environment variables which one of them it is.
+Each process runs the same command. torchrun tells each one its rank through environment variables.
 """
 
 from __future__ import annotations
@@ -25,32 +25,33 @@ from wiw.errors import ArgumentError, DependencyError, InfrastructureError
 PORT = 29500
 """Port of the first machine, where torchrun's agents meet."""
 STOP_SECONDS = 600
-"""Time that a stopped training has to end its step and to write its state: before torchrun ends its processes, and
-between SLURM's signal and the time limit."""
+"""Seconds that a stopped training has for finishing its step and writing its state: before torchrun kills its
+processes, and between SLURM's signal and the time limit."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class ProcessLayout:
-    """Processes of a training, and what their SLURM job asks for where there is one.
+    """The processes of a training, and the resources of their SLURM job, if any.
 
     Raises:
         ArgumentError: a number out of range.
     """
 
     gpus: Annotated[int, arg(metavar="N")] = 1
-    """GPUs of a machine that a video model is trained on, a process each; processes on the CPU where there is none."""
+    """GPUs per machine to train a video model on, one process each; processes on the CPU if there are none."""
     nodes: Annotated[int, arg(metavar="N")] = 1
-    """Machines; with several, or with a partition, training is submitted as a SLURM job; needs wiw[slurm]."""
+    """Number of machines. With several, or with a partition, training is submitted as a SLURM job, which requires
+    wiw[slurm]."""
     partition: Annotated[str | None, arg(metavar="NAME")] = None
     """SLURM partition."""
     hours: Annotated[float, arg(metavar="N")] = 24.0
-    """Time limit of the SLURM job; one that reaches it is requeued and resumes."""
+    """Time limit of the SLURM job in hours; a job that reaches it is requeued and resumes."""
     requeues: Annotated[int, arg(metavar="N")] = 50
-    """How often the job may reach its time limit."""
+    """How often the job may be requeued."""
     cpus: Annotated[int | None, arg(metavar="N")] = None
-    """Cores per machine of the job."""
+    """Cores per machine."""
     memory: Annotated[float | None, arg(metavar="GB")] = None
-    """Memory per machine of the job in gigabytes."""
+    """Memory per machine in gigabytes."""
     account: Annotated[str | None, arg(metavar="NAME")] = None
     """SLURM account."""
     qos: Annotated[str | None, arg(metavar="NAME")] = None
@@ -67,7 +68,8 @@ class ProcessLayout:
         given = [f"--{each.name}" for each in of_jobs if getattr(self, each.name) != each.default]
         if given and not self.is_job:
             raise ArgumentError(
-                f"{', '.join(given)}: of a SLURM job; name its --partition, or leave this out to train on this machine"
+                f"{', '.join(given)}: only for SLURM jobs; name a --partition, or leave this out to train on this "
+                "machine"
             )
 
     @property
@@ -136,7 +138,7 @@ def list_options(layout: ProcessLayout, host: str, name: str) -> list[str]:
 def run_processes(arguments: Sequence[str], layout: ProcessLayout) -> int:
     """Run a command of wiw on several processes of this machine, and return its exit code.
 
-    SIGTERM and Ctrl-C are handed on to all processes, and do once these have ended what they would have done.
+    SIGTERM and Ctrl-C are passed on to all processes, and do once these have ended what they would have done.
     """
     from torch.distributed import run
     from torch.distributed.elastic.multiprocessing import SignalException
@@ -144,7 +146,7 @@ def run_processes(arguments: Sequence[str], layout: ProcessLayout) -> int:
 
     os.environ |= {key: os.environ.get(key, value) for key, value in _list_settings(layout).items()}
     stopped, code = 0, 0
-    with _lend_signals():
+    with _release_signals():
         try:
             run.run(run.parse_args([*list_options(layout, "localhost", "wiw"), *_list_module(arguments)]))
         except ChildFailedError as error:
@@ -157,7 +159,7 @@ def run_processes(arguments: Sequence[str], layout: ProcessLayout) -> int:
 
 
 @contextmanager
-def _lend_signals() -> Iterator[None]:
+def _release_signals() -> Iterator[None]:
     """Let torchrun handle signals, as long as the context lasts."""
     numbers = (signal.SIGTERM, signal.SIGINT, signal.SIGHUP, signal.SIGQUIT)
     earlier = {number: signal.getsignal(number) for number in numbers}
@@ -198,7 +200,7 @@ def submit_job(arguments: Sequence[str], layout: ProcessLayout, folder: str | Pa
         return str(executor.submit(TrainingJob(arguments, layout)).job_id)
     except (RuntimeError, OSError, submitit.core.utils.FailedSubmissionError) as error:
         raise InfrastructureError(
-            f"the job cannot be submitted: {error}; expected a machine from which sbatch works. --dry-run prints the "
+            f"the job cannot be submitted: {error}; expected a machine on which sbatch works. --dry-run prints the "
             "command to run on each machine by hand"
         ) from error
 

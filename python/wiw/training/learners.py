@@ -37,7 +37,7 @@ def make_learner(name: str) -> Learner:
     """Return a learner by the name of its world model.
 
     Raises:
-        ArgumentError: there is none of that name.
+        ArgumentError: the name is unknown.
         DependencyError: torch or safetensors is not installed.
     """
     if name not in LEARNERS:

@@ -45,7 +45,7 @@ class NavigationRules:
     """Square metres; the largest island of a scene is traversed whatever its area, others only above this."""
     max_segment_frames: int = 750
     max_scene_frames: int = 7500
-    """Most frames of one pass over a scene, all islands together."""
+    """Maximum number of frames of one pass over a scene, all islands together."""
 
     def __post_init__(self) -> None:
         positive = ("density", "min_samples", "spacing", "leaf_ratio", "lookahead", "goal_radius")

@@ -39,7 +39,7 @@ HEADING_SPREAD = 1.0
 LEAST_BEARING = 0.3
 """Metres from the goal below which it has no direction."""
 FRONT_SHARE = 0.1
-"""Share of places of which the network sees the front view alone."""
+"""Share of places of which the network only sees the front view."""
 GOAL_TRIES = 4
 """Headings at a goal of which the one that sees farthest is its view, as in episodes."""
 GOALS_PER_PLACE = 2
@@ -51,7 +51,7 @@ class Recipe:
     """Hyper-parameters of the training."""
 
     epochs: int = 4
-    """How often each place is used, on average."""
+    """Number of times each place is used, on average."""
     scenes: int = 3
     """Scenes in a batch."""
     places: int = 12
@@ -195,7 +195,7 @@ class Pairs:
     goals: Tensor
     """[P, 4, 32, 32]."""
     metres: Tensor
-    """[P * P]; inf where there is no way."""
+    """[P * P]; inf if there is no path."""
     bearings: Tensor
     """[P * P] azimuths from the panorama's front, in radians, left positive."""
     visible: Tensor
@@ -367,7 +367,7 @@ def evaluate(
     Returns:
         {"pairs": N, "auc": {"network": ..., "similarity": ..., "both": ...}, "bearing": {"0.3-2": {"network": ...,
         "similarity": ..., "within_45": ..., "pairs": ...}, ...}}: the probability that a pair within 2 m is rated
-        nearer than one that is farther apart (None where all pairs are near, or none), and median errors of the bearing
+        nearer than one that is farther apart (None if all pairs are near, or none), and median errors of the bearing
         in degrees by range of distance.
 
     Raises:
@@ -381,7 +381,8 @@ def evaluate(
     ]
     if not parts:
         raise ArgumentError(
-            f"navigator: expected held-out scenes with two places within {FAR:g} m of each other, got none; name others"
+            f"navigator: expected held-out scenes with two places within {FAR:g} m of each other, got none; choose "
+            "others"
         )
     metres = np.concatenate([part.metres for part in parts])
     similarity = np.concatenate([part.similarity for part in parts])
@@ -435,7 +436,7 @@ def _find_pairs(scene: GoalPlaces) -> NDArray[np.bool_]:
 
 
 def _fill_panoramas(bands: NDArray[np.uint8]) -> NDArray[np.uint8]:
-    """Return panoramas [N, 64, 128, 3] of which only the bands are shown; the matcher reads no more."""
+    """Return panoramas [N, 64, 128, 3] with everything but the bands hidden; the matcher reads no more."""
     whole = np.zeros((len(bands), *appearance.PANORAMA, 3), np.uint8)
     whole[:, BAND_ROWS] = bands
     return whole

@@ -50,7 +50,7 @@ class Recipe:
     """Hyper-parameters of the training."""
 
     epochs: int = 4
-    """How often each view is used, on average."""
+    """Number of times each view is used, on average."""
     batch: int = 4
     widths: tuple[int, int, int, int] = (32, 64, 128, 192)
     """Channels of the U-Net's levels."""

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""How training data is prepared: by how many processes, and where it is cached."""
+"""Options for preparing training data: the number of processes, and the cache."""
 
 from __future__ import annotations
 
@@ -18,16 +18,16 @@ ProgressBar = Callable[[Iterable[Any], str, int], Iterable[Any]]
 
 @dataclass(frozen=True, kw_only=True)
 class Preparation:
-    """How training data is prepared.
+    """Options for preparing training data.
 
     Raises:
         ArgumentError: no workers.
     """
 
     workers: Annotated[int, arg(metavar="N")] = 2
-    """Processes that prepare the training data."""
+    """Number of processes that prepare the training data."""
     cache: Annotated[Path | None, arg(metavar="DIR", help_behavior_hint="")] = None
-    """Folder of prepared training data; it can be deleted at any time. Default: $WIW_CACHE/looks."""
+    """Folder for prepared training data, which can be deleted at any time. Default: $WIW_CACHE/looks."""
 
     def __post_init__(self) -> None:
         if self.workers < 1:
@@ -49,5 +49,5 @@ PREPARATION = Preparation()
 
 
 def show_no_bar(items: Iterable[Any], text: str, total: int) -> Iterable[Any]:
-    """Stand for a progress bar where none is shown."""
+    """Return the items as they are, in place of a progress bar."""
     return items

@@ -36,7 +36,7 @@ from wiw.training.trainer import run_training, warmup_cosine_schedule
 REAL_COLUMN = 4
 """Column of `Glimpses.scalars` that marks real glimpses."""
 MAX_EXTRA_GLIMPSES = 4
-"""Most glimpses of a set that training adds to the first."""
+"""Maximum number of glimpses of a set that training adds to the first."""
 CONFUSION_RATE = 0.05
 """Share by which a batch changes the running confusion of categories."""
 
@@ -51,12 +51,12 @@ class Recipe:
     width: int = 32
     """Channels of the first layer."""
     sizes: bool = True
-    """Whether the network is told estimates of sizes in metres."""
+    """Whether the network receives estimates of sizes in metres."""
     rate: float = 3e-3
     decay: float = 0.02
     smoothing: float = 0.05
     hard: int = 4
-    """How often sets whose first look is hard count."""
+    """Weight of sets whose first look is hard."""
     alone: float = 0.5
     """Weight of the loss of single glimpses beside that of sets."""
     recolor: float = 0.5
@@ -91,11 +91,11 @@ def make_weights(
         out: file of the weights.
         scenes: training scenes, as in `wiw run --scenes`.
         val: held-out scenes.
-        categories: what is told apart.
+        categories: the categories to distinguish.
         rules: which glimpses are recorded.
         recipe: how to train; its seed is that of the glimpses, too.
         minutes: if given, reduces the number of epochs so that training takes about this long.
-        start: recogniser whose training goes on; None for random weights.
+        start: recogniser to continue training from; None for random weights.
         preparation: how glimpses are recorded and cached.
         on_step: called after each step with its number, the number of all steps and a running mean of the loss.
         bar: shows the progress of recording.
@@ -104,7 +104,7 @@ def make_weights(
         The recogniser in the file, with its card.
 
     Raises:
-        ArgumentError: scenes that are both trained and evaluated on, or show nothing of the categories; a start of
+        ArgumentError: scenes that are both trained and evaluated on, or have no object of the categories; a start of
             other categories or another width.
         FileError: a file cannot be written.
     """
@@ -140,7 +140,7 @@ def train(
         recipe: how to train; see `Recipe`.
         minutes: if given, reduces the number of epochs so that training takes about this long.
         on_step: called after each step with its number, the number of all steps and a running mean of the loss.
-        start: network of the same categories and width whose training goes on; None for a new one.
+        start: network of the same categories and width whose training continues; None for a new one.
 
     Raises:
         ArgumentError: `start` has other categories or another width.
@@ -151,7 +151,9 @@ def train(
             f"{start.categories} and {start.width}"
         )
     if start is not None and start.sizes and not recipe.sizes:
-        raise ArgumentError("recogniser: expected a recipe with sizes, as the start is told them, got one without")
+        raise ArgumentError(
+            "recogniser: the weights to start from use sizes, so the recipe must, too; expected sizes=True, got False"
+        )
     steps_per_epoch = max(1, len(data) // recipe.batch)
     trainer, recipe = run_training(
         lambda: _Trainer(data, categories, recipe, start),

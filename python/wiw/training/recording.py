@@ -19,7 +19,7 @@ from wiw.tabletop.workbench import WRIST, Film, Workbench
 
 Backend = Literal["auto", "cpu", "gpu"]
 POSES = 15
-"""Most poses of an expert, as in an episode of the evaluation."""
+"""Maximum number of poses of an expert, as in an episode of the evaluation."""
 ATTEMPTS = 20
 """Tables set up for one demonstration before its expert counts as broken."""
 FIRST_SEED = 2**31

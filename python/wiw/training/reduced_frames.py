@@ -120,7 +120,7 @@ def compute_log_distances(metres: NDArray[Any]) -> NDArray[np.float32]:
 def _decode_small(
     segment: NavigationSegment, size: tuple[int, int], frame: int
 ) -> tuple[NDArray[np.uint8], NDArray[np.float16]]:
-    """Return a frame's picture, and its log-distances, empty where no depth was collected."""
+    """Return a frame's picture, and its log-distances, empty if no depth was collected."""
     color, depth = segment.decode(frame)
     if depth is None:
         return shrink_panorama(color, size), np.zeros((0, 0), np.float16)

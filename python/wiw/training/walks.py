@@ -23,7 +23,7 @@ PROBE_SPACING = 0.1
 
 @dataclass(frozen=True)
 class WalkRules:
-    """How a scene is sampled. Lengths in metres."""
+    """Rules for sampling a scene. Lengths in metres."""
 
     places: int = 24
     """Straight walks in a scene."""
@@ -59,7 +59,9 @@ def merge_walks(parts: Sequence[Walks]) -> Walks:
         ArgumentError: there is not one walk in them.
     """
     if not sum(map(len, parts)):
-        raise ArgumentError("expected scenes in which one can walk straight ahead, got none; name others (--scenes)")
+        raise ArgumentError(
+            "expected scenes in which an agent can walk straight ahead, got none; choose others (--scenes)"
+        )
     return Walks(
         *(np.concatenate([getattr(part, name) for part in parts]) for name in ("images", "distances", "places"))
     )

@@ -39,7 +39,7 @@ class Recipe:
     """Hyper-parameters of the training."""
 
     epochs: int = 6
-    """How often each panorama is used as a source, on average."""
+    """Number of times each panorama is used as a source, on average."""
     batch: int = 4
     widths: tuple[int, int, int] = (32, 64, 128)
     """Channels of the U-Nets' levels."""
@@ -244,17 +244,17 @@ def evaluate(
         `paths` places of each scene with 1.6 m free ahead, over whole panoramas, weighted by latitude.
 
     Raises:
-        ArgumentError: there is no such place in the scenes.
+        ArgumentError: the scenes have no such place.
     """
     names = scenes.resolve(specs)
     rows = [
         row
-        for name in bar(names, f"measuring on {specs}", len(names))
+        for name in bar(names, f"evaluating on {specs}", len(names))
         for row in _evaluate_scene(model, name, seed, paths)
     ]
     if not rows:
         raise ArgumentError(
-            f"{specs}: nowhere are {EVALUATED_STEPS[-1] * STRIDE:.1f} m free ahead; name others (--val)"
+            f"{specs}: nowhere is {EVALUATED_STEPS[-1] * STRIDE:.1f} m of free floor ahead; choose others (--val)"
         )
     means = {
         measure: {

@@ -49,7 +49,7 @@ class Waypoints:
         return self._remaining[: self._leaf_count]
 
     def find_next(self, position: NDArray[np.float32], current: int) -> int | None:
-        """Return the index of the waypoint to go to from a position on the mesh; None where only `current` is left."""
+        """Return the index of the waypoint to go to from a position on the mesh; None if only `current` is left."""
         candidates = self.candidates[self.candidates != current]
         if not len(candidates):
             return None

@@ -54,7 +54,7 @@ def save_sheet(task: Task, episodes: Sequence[Episode], path: Path) -> Path:
         FileError: the file cannot be written.
     """
     if task.name != "imagenav":
-        raise ArgumentError(f"--sheet draws starts and goals of imagenav; task '{task.name}' has other episodes")
+        raise ArgumentError(f"--sheet draws starts and goals of imagenav only, not episodes of task '{task.name}'")
     chosen = sorted({round(i) for i in np.linspace(0, len(episodes) - 1, min(MOST_ROWS, len(episodes)))})
     drawn = draw_episodes(task, [episodes[i] for i in chosen])
     with atomic_file(path) as draft:

@@ -41,7 +41,7 @@ def show(decision: Decision) -> DecisionFigure:
     """
     if decision.observation is None:
         raise ArgumentError(
-            "show: the decision carries no observation; take it from agent.decide, or open the run's report"
+            "show: the decision contains no observation; show one returned by agent.decide, or open the run's report"
         )
     rows = len(decision.proposals)
     figure = DecisionFigure(figsize=(WIDTH, TOP + ROW * rows), layout="constrained")

@@ -34,7 +34,7 @@ class Client(ABC):
     """
 
     concurrency: int = 1
-    """Most requests at a time."""
+    """Maximum number of requests at a time."""
 
     def __init__(
         self,
@@ -79,7 +79,7 @@ class Client(ABC):
         """Ask all requests at once, and repeat those that need it, until each has its reply.
 
         Raises:
-            VlmError: see `complete`; nothing is answered then. An unusable answer is no error: it is in the reply.
+            VlmError: see `complete`; nothing is answered then. An unusable answer is not an error: it is in the reply.
         """
         talks = [Conversation(request, self.top_logprobs, self.votes) for request in requests]
         try:

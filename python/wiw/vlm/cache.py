@@ -59,7 +59,7 @@ class ReplyCache:
         return ReplyCache, (self.folder, self.budget_gb)
 
     def get(self, name: str) -> Completion | None:
-        """Return the answer of that name; None where there is none."""
+        """Return the answer of that name; None if there is none."""
         if self._broken or not (self.folder / "replies.sqlite").exists():
             return None
         try:
@@ -70,9 +70,9 @@ class ReplyCache:
                 connection.execute("UPDATE reply SET used = ? WHERE name = ?", (time.time(), name))
             return Completion.from_json(json.loads(row[0]))
         except (sqlite3.Error, OSError) as error:
-            self._give_up(error)
+            self._disable(error)
         except (ValueError, KeyError, TypeError) as error:
-            _log.warning("kept answer %s is damaged (%s); it is asked for anew", name, error)
+            _log.warning("cached answer %s is damaged (%s); it is requested again", name, error)
         return None
 
     def put(self, answers: Mapping[str, Completion]) -> None:
@@ -86,7 +86,7 @@ class ReplyCache:
                 connection.executemany("INSERT OR REPLACE INTO reply VALUES (?, ?, ?)", rows)
                 self._trim(connection)
         except (sqlite3.Error, OSError) as error:
-            self._give_up(error)
+            self._disable(error)
 
     def _open(self) -> sqlite3.Connection:
         if self._connection is None or self._process != os.getpid():
@@ -109,6 +109,6 @@ class ReplyCache:
             (total - 0.9 * budget,),
         )
 
-    def _give_up(self, error: Exception) -> None:
+    def _disable(self, error: Exception) -> None:
         self._broken = True
-        _log.warning("answers are no longer cached: %s; free disk space or name another folder", error)
+        _log.warning("answers are no longer cached: %s; free some disk space or choose another folder", error)

@@ -50,10 +50,10 @@ def split_options(count: int, most: int) -> list[list[int]]:
 def read_logprobs(
     listed: Sequence[tuple[str, float]], labels: Sequence[str]
 ) -> tuple[NDArray[np.float64], NDArray[np.float64]] | None:
-    """Return the labels' probabilities, which sum to 1, and those that the model gave them; None where none is listed.
+    """Return the labels' probabilities, which sum to 1, and those that the model gave them; None if none is listed.
 
     Variants of a label ("A", " A", "(A") are one. Of the former, a label that is not listed gets the most that it can
-    have: as much as the least likely listed token, or as what all of these leave over; of the latter, nothing.
+    have: as much as the least likely listed token, or the remaining probability; of the latter, nothing.
     """
     listed = [(token, min(value, 0.0)) for token, value in listed if not math.isnan(value)]
     found = [
@@ -71,7 +71,7 @@ def read_logprobs(
 
 
 def count_votes(texts: Sequence[str], labels: Sequence[str]) -> tuple[NDArray[np.float64], NDArray[np.float64]] | None:
-    """Return each label's share of the votes, and of all samples; None where no sample begins with a label."""
+    """Return each label's share of the votes, and of all samples; None if no sample begins with a label."""
     votes = [vote for vote in (parse_vote(text, labels) for text in texts) if vote is not None]
     if not votes:
         return None

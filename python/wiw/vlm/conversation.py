@@ -15,7 +15,7 @@ from wiw.vlm import choices, structured
 from wiw.vlm.messages import Call, Completion, CompletionRecord, Problem, Reply, Request
 
 RETRY_TEMPERATURE = 0.7
-"""Least temperature of a repeated question: at 0 the same answer would come."""
+"""Minimum temperature of a repeated question: at 0 the answer would be the same."""
 VOTE_TOKENS = 8
 Talk = Generator[list[Call], list[Completion], Reply]
 
@@ -150,7 +150,7 @@ def _ask_groups(
 
 
 def _list_logprobs(completion: Completion) -> tuple[tuple[str, float], ...]:
-    """Return the listed tokens: none of an answer that was withheld."""
+    """Return the listed tokens: none for an answer that was withheld."""
     return () if completion.finish in structured.REFUSED else completion.logprobs or ()
 
 

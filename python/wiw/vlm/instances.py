@@ -15,7 +15,7 @@ PHRASES = ("the way ahead is clear", "something is in the way", "it is on the le
 MAX_ITEMS = 8
 """Most items of an array whose schema has no limit."""
 MAX_INTEGERS = 1000
-"""Most values that are enumerated from an integer's minimum."""
+"""Maximum number of values that are enumerated from an integer's minimum."""
 
 
 def generate_instance(schema: Mapping[str, Any], choose: Choose) -> str:

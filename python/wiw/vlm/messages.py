@@ -52,13 +52,13 @@ class Request:
     exact_seed: bool = False
     """Whether the first call for text or JSON has `seed` itself, as a published protocol may ask for."""
     max_tokens: int = 1024
-    """Most tokens of an answer that is not a choice."""
+    """Maximum number of tokens of an answer that is not a choice."""
     tries: int = 3
     """Times that it is asked before an unusable answer counts as the outcome."""
 
     def __post_init__(self) -> None:
         if self.choices and self.schema is not None:
-            raise ArgumentError("vlm: a request has choices or a schema, not both")
+            raise ArgumentError("vlm: a request takes choices or a schema, not both")
         if len(self.choices) == 1 or len(set(self.choices)) != len(self.choices):
             raise ArgumentError(f"vlm: expected at least two different choices, got {self.choices}")
         if self.tries < 1:
@@ -89,7 +89,7 @@ class Completion:
     finish: str = "stop"
     """"stop", "length", "refusal", "huge", or the server's own word."""
     logprobs: tuple[tuple[str, float], ...] | None = None
-    """Likeliest first tokens; None where the server returns none."""
+    """Likeliest first tokens; None if the server returns none."""
     prompt_tokens: int = 0
     completion_tokens: int = 0
     retries: int = 0

@@ -23,15 +23,17 @@ from wiw.vlm.messages import Call, Completion, Message
 Dialect = Literal["openai", "vllm", "legacy"]
 DIALECTS = ("openai", "vllm", "legacy")
 MOST_BYTES = 4 << 20
-"""Most bytes of a reply's body; what goes beyond is not read."""
+"""Maximum size of a reply's body in bytes; what goes beyond is not read."""
 MOST_OF_AN_ERROR = 1 << 16
 """Bytes of an error's body that are read."""
 LONGEST_WAIT = 60.0
-"""Seconds that are waited before a request is sent again, however long the server asks for."""
-REFUSED_LOGPROBS = "; top_logprobs= says how many first tokens the server lists, 0 has choices voted on instead"
+"""Maximum wait in seconds before a request is sent again, whatever the server demands."""
+REFUSED_LOGPROBS = (
+    "; set top_logprobs= to the number of first tokens that the server lists, or to 0 to vote on choices instead"
+)
 NOBODY_THERE = (
-    ": no server answers there; start one (docs/vlm.md), name another with --vlm URL, or give --vlm mock to go through "
-    "the motions without a model"
+    ": no server answers there; start one (docs/vlm.md), give another with --vlm URL, or use --vlm mock for a dry run "
+    "without a model"
 )
 _PASSING = (408, 409, 425, 429)
 """Client errors that may pass; so may all of the server's, 500 and above."""
@@ -45,7 +47,7 @@ class OpenAIClient(Client):
         model: its name there; None means the only one that the server offers.
         dialect: how choices and schemas are sent beside the prompt. "openai": `response_format`; "vllm":
             `structured_outputs` too, for choices; "legacy": `guided_choice` and `guided_json` (vLLM before 0.12).
-        concurrency: most requests at a time.
+        concurrency: maximum number of requests at a time.
         timeout: seconds that one request may take.
         attempts: times that it is sent in all while the server is busy or fails; how long it asks to wait is heeded.
         image_format: "png", or "jpeg" for slow connections.
@@ -87,7 +89,7 @@ class OpenAIClient(Client):
         self._given |= {"timeout": timeout, "attempts": attempts, "image_format": image_format, **options}
 
     def __reduce__(self) -> Any:
-        return _remade, (self.base_url, self._given)
+        return _rebuild_client, (self.base_url, self._given)
 
     @property
     def model(self) -> str:
@@ -100,7 +102,7 @@ class OpenAIClient(Client):
             names = [str(each.id) for each in self._ask_with_retries(lambda: list(self._sdk.models.list()))]
             if len(names) != 1:
                 raise VlmError(
-                    f"{self.base_url} offers {', '.join(names) or 'no models'}; name one as model=", "refused"
+                    f"{self.base_url} offers {', '.join(names) or 'no models'}; choose one with model=", "refused"
                 )
             self._model = names[0]
         return self._model
@@ -134,7 +136,7 @@ class OpenAIClient(Client):
         try:
             import openai
         except ImportError:
-            raise DependencyError("asking OpenAI-compatible servers needs openai: pip install 'wiw[vlm]'") from None
+            raise DependencyError("OpenAI-compatible servers need openai: pip install 'wiw[vlm]'") from None
         import os
 
         key = self._key or os.environ.get("OPENAI_API_KEY") or "none"
@@ -179,7 +181,7 @@ class OpenAIClient(Client):
         until = time.monotonic() + self.timeout
         data = bytearray()
         with self._sdk.chat.completions.with_streaming_response.create(**body) as response:
-            for piece in _pieces(response):
+            for piece in _iterate_body(response):
                 data += piece
                 if len(data) > MOST_BYTES:
                     return Completion(data[:1000].decode("utf-8", "replace"), "huge")
@@ -198,27 +200,27 @@ class OpenAIClient(Client):
         retries = retries or _Retries()
         while True:
             try:
-                return _within(self.timeout, work)
+                return _run_within(self.timeout, work)
             except openai.APIStatusError as error:
                 passing = error.status_code in _PASSING or error.status_code >= 500
                 said, kind, wait = (
-                    f"{error.status_code} {_short(error)}",
+                    f"{error.status_code} {_shorten(error)}",
                     "status" if passing else "refused",
                     _read_retry_after(error),
                 )
             except (openai.APITimeoutError, TimeoutError) as error:
                 passing, said, kind, wait = (
                     True,
-                    _short(error) or f"no answer within {self.timeout:g} s",
+                    _shorten(error) or f"no answer within {self.timeout:g} s",
                     "timeout",
                     None,
                 )
             except _NoCompletionError as error:
-                passing, said, kind, wait = True, _short(error), "protocol", None
+                passing, said, kind, wait = True, _shorten(error), "protocol", None
             except _BrokenOffError as error:
-                passing, said, kind, wait = True, _short(error), "unreachable", None
+                passing, said, kind, wait = True, _shorten(error), "unreachable", None
             except openai.APIError as error:
-                passing, said, kind, wait = True, f"{type(error).__name__}: {_short(error)}", "unreachable", None
+                passing, said, kind, wait = True, f"{type(error).__name__}: {_shorten(error)}", "unreachable", None
             if not passing or retries.count + 1 >= self.attempts:
                 times = f"{retries.count + 1} tries" if retries.count else "1 try"
                 hint = REFUSED_LOGPROBS if kind == "refused" and "logprob" in said else ""
@@ -228,7 +230,7 @@ class OpenAIClient(Client):
             retries.count += 1
 
 
-def _within(seconds: float, work: Callable[[], Any]) -> Any:
+def _run_within(seconds: float, work: Callable[[], Any]) -> Any:
     """Do the work in a separate thread, which is abandoned after `seconds`.
 
     The transport limits each read but not their sum, so headers that drip in would take any time.
@@ -262,14 +264,14 @@ class _Retries:
 
 
 class _NoCompletionError(Exception):
-    """A reply that is no chat completion."""
+    """A reply that is not a chat completion."""
 
 
 class _BrokenOffError(Exception):
     """A connection that ended before the reply did."""
 
 
-def _pieces(response: Any) -> Iterator[bytes]:
+def _iterate_body(response: Any) -> Iterator[bytes]:
     """Yield the body in pieces; the transport's errors, which have private classes, become `_BrokenOffError`."""
     try:
         yield from response.iter_bytes()
@@ -297,11 +299,11 @@ def _begin(response: Any, seconds: float) -> Any:
     return Begin()
 
 
-def _remade(base_url: str, options: dict[str, Any]) -> OpenAIClient:
+def _rebuild_client(base_url: str, options: dict[str, Any]) -> OpenAIClient:
     return OpenAIClient(base_url, **options)
 
 
-def _short(error: Exception) -> str:
+def _shorten(error: Exception) -> str:
     return " ".join(str(error).split())[:300]
 
 
@@ -364,7 +366,7 @@ def _clean(text: str) -> str:
 
 
 def _first_token(logprobs: Any) -> tuple[tuple[str, float], ...] | None:
-    """Return the likeliest first tokens; None where the server lists none."""
+    """Return the likeliest first tokens; None if the server lists none."""
     tokens = (logprobs or {}).get("content") or []
     listed = tokens[0].get("top_logprobs") or [] if tokens else []
     pairs = tuple((_clean(str(each["token"])), float(each["logprob"])) for each in listed)

@@ -18,7 +18,7 @@ class Prices:
     table: Mapping[str, tuple[float, float]] = field(default_factory=dict)
 
     def compute_cost(self, model: str, read: int, written: int) -> float | None:
-        """Return the cost in US dollars; None where the price is unknown."""
+        """Return the cost in US dollars; None if the price is unknown."""
         price = self.table.get(model)
         return None if price is None else (price[0] * read + price[1] * written) / 1e6
 

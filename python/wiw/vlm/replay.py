@@ -52,7 +52,7 @@ class ReplayClient(Client):
         for name, call in zip(names, calls, strict=True):
             if name not in self._answers:
                 begin = next((part for part in call.messages[-1].content if isinstance(part, str)), "")[:80]
-                raise VlmError(f"{self.path} holds no answer to this question ({name}): '{begin}...'", "missing")
+                raise VlmError(f"{self.path} has no answer to this question ({name}): '{begin}...'", "missing")
         return [self._answers[name] for name in names]
 
 

@@ -29,7 +29,7 @@ def make_problem(kind: Kind, detail: str, completion: Completion) -> Problem:
 
 
 def find_problem(completion: Completion) -> Problem | None:
-    """Return what makes a completion unusable for any request; None where it may be parsed."""
+    """Return what makes a completion unusable for any request; None if it may be parsed."""
     if completion.finish == "huge" or len(completion.text) > MAX_CHARACTERS:
         return make_problem("huge", f"more than {MAX_CHARACTERS} characters", completion)
     if completion.finish in REFUSED:
@@ -65,7 +65,7 @@ def parse_object(completion: Completion, schema: type[BaseModel]) -> tuple[Any, 
 
 
 def find_json_object(text: str) -> tuple[str, bool]:
-    """Return the first {...} in a text, and whether it is complete; braces in strings do not count. Empty where there
+    """Return the first {...} in a text, and whether it is complete; braces in strings do not count. Empty if there
     is none.
     """
     begin = text.find("{")

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Templates in Jinja's sandbox, and a process of its own that fills a user's within bounds (`python FILE`).
+"""Templates in Jinja's sandbox, and a separate process that fills a user's within bounds (`python FILE`).
 
 The sandbox keeps a template from the rest of the program, but not from taking all time or memory, and a single
 expression can do that inside compiled code. So the process has the kernel's limits. It reads pickled jobs from its
@@ -25,15 +25,15 @@ SECONDS = 2.0
 MEMORY = 256 << 20
 """Bytes of address space."""
 CHARACTERS = 1 << 20
-"""Most characters of one prompt."""
+"""Maximum number of characters of one prompt."""
 ENVIRONMENT = SandboxedEnvironment(undefined=StrictUndefined, trim_blocks=True, lstrip_blocks=True)
 
 
 def unknown_slot(source: str, slots: Mapping[str, Any]) -> str | None:
-    """Return the first variable of a template that is no slot, if there is one.
+    """Return the first variable of a template that is not a slot, if there is one.
 
     Raises:
-        TemplateSyntaxError: the source is no template.
+        TemplateSyntaxError: the source is not a template.
     """
     kinds = [kind for _, kind, _ in ENVIRONMENT.lex(source)]
     for name in ("raw", "comment"):  # Jinja takes one that is open at the end for an empty one
@@ -60,7 +60,7 @@ def fill_template(source: str, slots: Mapping[str, Any]) -> str:
         parts.append(part)
         size += len(part)
         if size > CHARACTERS:
-            raise ValueError(f"expected a prompt of at most {CHARACTERS} characters, and this one has more")
+            raise ValueError(f"expected a prompt of at most {CHARACTERS} characters, but this one has more")
     return "".join(parts)
 
 

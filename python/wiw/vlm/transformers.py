@@ -54,7 +54,7 @@ class TransformersClient(Client):
             network: Any = hf.AutoModelForImageTextToText.from_pretrained(self.path, dtype=dtype or "auto")
         except (OSError, ValueError) as error:
             raise WeightsError(
-                f"{self.path}: no vision-language model can be loaded from there: {error}. Expected a folder with "
+                f"{self.path}: cannot load a vision-language model from there: {error}. Expected a folder with "
                 "config.json, weights and processor, or a hub name that this machine can reach"
             ) from error
         self._network = network.to(self.device).eval()

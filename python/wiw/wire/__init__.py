@@ -1,2 +1,2 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What goes between a served world model and those who ask it: versioned msgpack messages, never pickle."""
+"""Messages between a served world model and its clients: versioned msgpack messages, never pickle."""

@@ -44,7 +44,7 @@ def announce_server(server: ServerAddress, file: Path) -> Iterator[None]:
 
 
 def read_addresses(place: Path) -> list[ServerAddress]:
-    """Return the servers that are announced in a file, or in the .json files of a folder; none where there are none."""
+    """Return the servers that are announced in a file, or in the .json files of a folder; none if there are none."""
     files = sorted(place.glob("*.json")) if place.is_dir() else [place]
     found = []
     for file in files:

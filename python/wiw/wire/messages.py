@@ -27,7 +27,7 @@ from wiw.wire.arrays import pack_array, unpack_array
 
 VERSION = 1
 MOST_BYTES = 256 * 2**20
-"""Most bytes of a message, in either direction; a server takes no more than a row of its model needs."""
+"""Maximum size of a message in bytes, in either direction; a server takes no more than a row of its model needs."""
 MOST_ITEMS = 32
 """Most items of any map or list, and of maps and lists in a message: unpacked they take many times the bytes that they
 came in, and msgpack makes room for as many items as are declared."""
@@ -53,7 +53,7 @@ class Welcome:
     unknown: str
     """Why it is empty."""
     in_flight: int
-    """Most rows of a client that may be unanswered at a time."""
+    """Maximum number of rows of a client that may be unanswered at a time."""
 
 
 @dataclass(frozen=True)
@@ -81,7 +81,7 @@ class Answer:
 
 @dataclass(frozen=True)
 class Wait:
-    """The row was not taken: ask again in so many seconds."""
+    """The row was not taken: retry after this many seconds."""
 
     id: bytes
     seconds: float
@@ -121,8 +121,8 @@ def decode(data: Any) -> Message:
     version, name = values.pop("v", None), values.pop("type", None)
     if version != VERSION or type(version) is not int:
         raise RemoteError(
-            f"this side speaks version {VERSION} of the protocol, the other one {_quote(version)}; install the same "
-            "version of wiw on both",
+            f"this side speaks version {VERSION} of the protocol, the other {_quote(version)}; install the same "
+            "version of wiw on both sides",
             "version",
         )
     kind = KINDS.get(name) if isinstance(name, str) else None
@@ -132,7 +132,7 @@ def decode(data: Any) -> Message:
 
 
 def unpack_map(what: str, data: Any) -> dict[Any, Any]:
-    """Return a msgpack map whose parts are no larger than the bytes that came.
+    """Return a msgpack map whose parts are not larger than the bytes that came.
 
     Raises:
         RemoteError: anything else.
@@ -144,7 +144,7 @@ def unpack_map(what: str, data: Any) -> dict[Any, Any]:
     try:
         values = msgpack.unpackb(data, list_hook=count, object_hook=count, **limits)
     except Exception as error:  # msgpack raises ValueError and others besides
-        raise RemoteError(f"{what}: no msgpack: {type(error).__name__}: {error}", "message") from None
+        raise RemoteError(f"{what}: not valid msgpack: {type(error).__name__}: {error}", "message") from None
     if not isinstance(values, dict):
         raise RemoteError(f"{what}: expected a map, got {type(values).__name__}", "message")
     return values
@@ -174,7 +174,7 @@ def read_fields(what: str, values: Mapping[Any, Any], readers: Mapping[str, Read
     """
     if set(values) != set(readers):
         missing, others = sorted(set(readers) - set(values)), len(set(values) - set(readers))
-        raise RemoteError(f"{what}: missing are {missing}, unknown are {others} fields", "message")
+        raise RemoteError(f"{what}: missing fields {missing}, unknown fields {others}", "message")
     return {name: reader(f"{what}.{name}", values[name]) for name, reader in readers.items()}
 
 
@@ -188,7 +188,7 @@ def blob(name: str, value: Any) -> bytes:
     return bytes(_of_type(name, value, bytes))
 
 
-def whole(name: str, value: Any) -> int:
+def read_count(name: str, value: Any) -> int:
     """Read a number from 0 to 2**64 - 1."""
     if _of_type(name, value, int) < 0:
         raise RemoteError(f"{name}: expected a number of at least 0, got {value}", "message")
@@ -205,7 +205,7 @@ def seconds(name: str, value: Any) -> float:
 READERS: Mapping[str, Reader] = {
     "str": text,
     "bytes": blob,
-    "int": whole,
+    "int": read_count,
     "float": seconds,
     "NDArray[np.uint8]": unpack_array,
 }

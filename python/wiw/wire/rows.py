@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from wiw.errors import RemoteError
 from wiw.types import Conditioning, Control, History
 from wiw.wire.arrays import pack_array, unpack_array
-from wiw.wire.messages import Reader, read_fields, text, unpack_map, whole
+from wiw.wire.messages import Reader, read_count, read_fields, text, unpack_map
 
 SEEN = ("image", "depth", "semantic")
 PAST = ("images", "poses", "actions", "lengths")
@@ -24,7 +24,7 @@ PLAN = ("actions", "trajectory", "viewpoints", "ids")
 
 @dataclass(frozen=True)
 class Row:
-    """One future that is asked for."""
+    """One future that is requested."""
 
     image: NDArray[np.uint8]
     depth: NDArray[np.float32] | None
@@ -153,7 +153,7 @@ def _past_actions(name: str, value: Any) -> NDArray[Any]:
     return array
 
 
-def _maybe(reader: Reader) -> Reader:
+def _make_optional(reader: Reader) -> Reader:
     return lambda name, value: None if value is None else reader(name, value)
 
 
@@ -162,19 +162,19 @@ _HISTORY_READERS: Mapping[str, Reader] = {
     "poses": _array("<f8", 2),
     "actions": _past_actions,
     "lengths": _array("<i8", 1),
-    "count": whole,
+    "count": read_count,
 }
 _READERS: Mapping[str, Reader] = {
     "image": _array("|u1", 3),
-    "depth": _maybe(_array("<f4", 2)),
-    "semantic": _maybe(_array("<u4", 2)),
-    "history": _maybe(_history),
+    "depth": _make_optional(_array("<f4", 2)),
+    "semantic": _make_optional(_array("<u4", 2)),
+    "history": _make_optional(_history),
     "actions": _array("|i1", 1),
     "trajectory": _array("<f8", 2),
     "viewpoints": _array("<f8", 3),
-    "ids": _maybe(_ids),
+    "ids": _make_optional(_ids),
     "text": text,
-    "length": whole,
-    "shared": whole,
-    "seed": whole,
+    "length": read_count,
+    "shared": read_count,
+    "seed": read_count,
 }

@@ -41,6 +41,6 @@ def make_copy(space: str = PRIMITIVES) -> Copy:
     made = {PRIMITIVES: Copy, GRIPPER_POSES: CopyFront}.get(space)
     if made is None:
         raise ArgumentError(
-            f"copy: expected plans in {PRIMITIVES} or {GRIPPER_POSES}, got '{space}'; write one for yours"
+            f"copy: expected plans in {PRIMITIVES} or {GRIPPER_POSES}, got '{space}'; implement a copy model for yours"
         )
     return made()

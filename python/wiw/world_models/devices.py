@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What a world model's networks need of a machine."""
+"""Requirements of a world model's networks on the machine."""
 
 from __future__ import annotations
 

@@ -3,5 +3,5 @@
 
 
 def none() -> None:
-    """Act without a world model: the same loop with imagination left out. Return None."""
+    """Act without a world model: the same loop without imagination. Return None."""
     return

@@ -19,13 +19,13 @@ from wiw.world_models.base import SMALLEST_PANORAMA, WorldModel, accepts
 class Oracle(WorldModel):
     """Carry the plan out in a fork of the simulator and return what it truly sees there.
 
-    No model imagines better, so its score is the reference for what imagination is worth to a policy. It is no strict
-    ceiling: a policy may succeed by chance where futures are wrong. It alone is handed the simulator.
+    No model imagines better, so its score is the reference for what imagination is worth to a policy. It is not a
+    strict ceiling: a policy may succeed by chance where futures are wrong. It alone is given the simulator.
 
     Args:
         size: height and width of its frames, whoever looks at them; where None, up to 576x1024 as the reviser needs,
             480x480 in front views and before a table.
-        view: "perspective" for front views alone in place of panoramas; before a table there is no other.
+        view: "perspective" for front views alone in place of panoramas; on a table there is no other view.
 
     Raises:
         ArgumentError: no size, or a view that the plans do not lead through.
@@ -110,13 +110,13 @@ class ArmOracle(Oracle):
 
 
 def make_oracle(space: str = PRIMITIVES, size: Sequence[int] | None = None, view: View | None = None) -> Oracle:
-    """Carry each plan out in a fork of the simulator.
+    """Execute each plan in a fork of the simulator.
 
     Return the model for plans of a space; `size` and `view` as for `Oracle`.
     """
     made = {PRIMITIVES: Oracle, GRIPPER_POSES: ArmOracle}.get(space)
     if made is None:
         raise ArgumentError(
-            f"oracle: expected plans in {PRIMITIVES} or {GRIPPER_POSES}, got '{space}'; write one for yours"
+            f"oracle: expected plans in {PRIMITIVES} or {GRIPPER_POSES}, got '{space}'; implement an oracle for yours"
         )
     return made(size, view)

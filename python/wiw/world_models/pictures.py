@@ -35,10 +35,10 @@ ALTERED: dict[str, Callable[[NDArray[np.float32]], NDArray[np.float32]]] = {
     "inverted": lambda picture: 255 - picture,
 }
 """Common mistakes with pictures, by name."""
-CHANNELS = "red and blue are exchanged (BGR): give RGB, as frames[..., ::-1] of what OpenCV gives"
+CHANNELS = "red and blue are swapped (BGR): give RGB; for OpenCV images use frames[..., ::-1]"
 SCALE = (
-    "no value is above 1: floats from 0 to 1 were cast to uint8 as they are; give "
-    "np.rint(np.clip(frames, 0, 1) * 255).astype(np.uint8)"
+    "no value is above 1: floats from 0 to 1 were cast to uint8 without scaling; give np.rint(np.clip(frames, 0, 1) * "
+    "255).astype(np.uint8)"
 )
 
 Picture = NDArray[np.float32]
@@ -71,8 +71,8 @@ def check_pictures(
         exact = np.array_equal(row[0], observed)
         if not exact and (fault := find_first_frame_fault(expected, row[0].astype(np.float32))):
             raise ContractError(
-                f"{name}.rollout: frame 0 is not the observation: {fault}. Frame k is what follows action k; "
-                "put the observation in front: frames[:, 0] = observations.image",
+                f"{name}.rollout: frame 0 is not the observation: {fault}. Frame k is what follows action k; put the "
+                "observation first: frames[:, 0] = observations.image",
                 "channels" if fault == CHANNELS else "frame 0",
             )
         if len(own) == 0:
@@ -96,7 +96,7 @@ def find_first_frame_fault(observed: Picture, found: Picture) -> str:
     for name, alter in ALTERED.items():
         if correlate(alter(one), other) >= max(ALIKE, alike + 0.05):
             return f"it is {name}"
-    return "" if alike >= OTHER else f"it is another picture (their correlation is {alike:.2f} of 1)"
+    return "" if alike >= OTHER else f"it is a different image (their correlation is {alike:.2f} of 1)"
 
 
 def are_channels_swapped(one: Picture, other: Picture, least: float = OTHER) -> bool:

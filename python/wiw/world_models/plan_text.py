@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The user's own words for plans, as an option of models that are told them in words."""
+"""The user's words for plans, as an option of models that take plans in words."""
 
 from __future__ import annotations
 
@@ -39,7 +39,7 @@ def make_template(words: str | Mapping[str, Any] | None) -> TextTemplate | None:
     Phrases may hold {metres}, {degrees} and {count}.
 
     Raises:
-        ArgumentError: a key that is none, a value that is no text, or a prompt without {actions}.
+        ArgumentError: an unknown key, a value that is not text, or a prompt without {actions}.
     """
     if words is None:
         return None

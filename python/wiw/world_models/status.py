@@ -13,7 +13,7 @@ from wiw.world_models.base import Requirements
 
 
 def lacks(requires: Requirements) -> list[str]:
-    """List what is missing, in a few words each; empty where the model is ready."""
+    """List what is missing, in a few words each; empty if the model is ready."""
     packages = requires.missing()
     found = [f"{', '.join(packages)} (pip install 'wiw[{requires.extra}]')"] if packages else []
     if requires.served and not is_served(requires.served, requires.server):
@@ -27,7 +27,7 @@ def lacks(requires: Requirements) -> list[str]:
 
 
 def is_served(name: str, address: str) -> bool:
-    """Return whether a server answers at an address and serves the model of that name; takes a second at most."""
+    """Return whether the server at an address serves the model of that name; takes a second at most."""
     from wiw.errors import RemoteError
     from wiw.world_models.remote.model import Remote
 

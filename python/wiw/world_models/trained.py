@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What the world models of `wiw train` share: weights that come with wiw or from a file, and their identity."""
+"""Common parts of the world models of `wiw train`: weights shipped with wiw or from a file, and their identity."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ class Trained(WorldModel):
     """A small network that runs on the CPU, in eval mode, with the card of how it was made and measured.
 
     Args:
-        weights: a file of `wiw train NAME`; None means those that come with wiw.
+        weights: a file of `wiw train NAME`; None means those shipped with wiw.
 
     Raises:
         DependencyError: torch or safetensors is not installed.

@@ -14,10 +14,10 @@ from wiw.world_models.base import SMALLEST_PANORAMA, WorldModel, accepts
 
 
 class Warp(WorldModel):
-    """Move the RGB-D panorama's depth mesh to the new pose and fill what was hidden from its background.
+    """Warp the RGB-D panorama's depth mesh to the new pose, and fill what was hidden from the background.
 
     Depth is the simulator's, as the paper grants every depth-aware model. The reference between floor and ceiling: a
-    video generator that scores less has not learnt what one depth image already tells.
+    video generator that scores lower has not learnt what a single depth image already shows.
     """
 
     accepts = accepts(

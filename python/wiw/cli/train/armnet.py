@@ -24,21 +24,21 @@ def train_armnet(
     limits: Annotated[Limits, arg(name="")] = NO_LIMITS,
     preparation: Annotated[Preparation, arg(name="")] = PREPARATION,
 ) -> int:
-    """Train armnet, a world model of manipulation: it predicts the front view after each gripper pose of a plan.
+    """Train armnet, a world model for manipulation that predicts the front view after each gripper pose of a plan.
 
     $ wiw train armnet --out armnet.safetensors
     $ wiw run manipulation --world-model armnet --world-model-option weights=armnet.safetensors
 
     Plays are simulated at the tables of the manipulation tasks and cached first, so that an interrupted command does
     not simulate them again. Training takes 15 to 30 minutes on two idle cores; repeat an interrupted command to resume
-    it. FILE also holds the recipe, and errors on held-out plays, beside copy and a table where nothing but the arm
-    moves. The weights that come with wiw were trained by this command with its defaults.
+    it. FILE also holds the recipe, and errors on held-out plays, next to copy and to a table where nothing but the arm
+    moves. The weights shipped with wiw were trained by this command with its defaults.
 
     Args:
-        out: Weights, a safetensors file.
-        plays: Simulated plays of eight gripper poses each.
-        demonstrations: Folder of `wiw collect manipulation`, as additional data.
-        epochs: How often each sample is used, on average. Default: 4.
+        out: File for the weights (safetensors).
+        plays: Number of simulated plays, of eight gripper poses each.
+        demonstrations: Folder of `wiw collect manipulation`, for additional data.
+        epochs: Number of epochs: how often each sample is used, on average. Default: 4.
         limits: Time limit and seed.
         preparation: How training data is prepared.
     """

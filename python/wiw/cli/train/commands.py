@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The networks that `wiw train` trains, a command each."""
+"""The networks that `wiw train` trains, one command each."""
 
 from __future__ import annotations
 
@@ -15,15 +15,15 @@ from wiw.cli.train.video import VIDEO, make_command
 from wiw.cli.train.warpnet import train_warpnet
 
 TRAININGS: tuple[tuple[Callable[..., int], str, str], ...] = (
-    (train_recogniser, "recogniser", "Policy of Active Recognition: names the object in a box. On scenes."),
-    (train_navigator, "navigator", "Policy of Image-Goal Navigation: where the goal is. On scenes."),
-    (train_warpnet, "warpnet", "World model of navigation: the panorama from a place nearby. On scenes."),
-    (train_pocket, "pocket", "World model of navigation: a small video diffusion model. On collected data."),
-    (train_perception, "perception", "Labeller of question answering: categories and states of pixels. On scenes."),
-    (train_armnet, "armnet", "World model of manipulation: the front view after each pose. On simulated plays."),
-    (train_diffuser, "diffuser", "The 3D diffusion policy of manipulation. On demonstrations."),
+    (train_recogniser, "recogniser", "Policy for Active Recognition: names the object in a box. From scenes."),
+    (train_navigator, "navigator", "Policy for Image-Goal Navigation: estimates where the goal is. From scenes."),
+    (train_warpnet, "warpnet", "World model for navigation: the panorama from a place nearby. From scenes."),
+    (train_pocket, "pocket", "World model for navigation: a small video diffusion model. From collected data."),
+    (train_perception, "perception", "Labeller for question answering: categories and states of pixels. From scenes."),
+    (train_armnet, "armnet", "World model for manipulation: the front view after each pose. From simulated plays."),
+    (train_diffuser, "diffuser", "The 3D diffusion policy for manipulation. From demonstrations."),
     *(
-        (make_command(name), name, f"{title}, post-trained to follow actions. On collected data.")
+        (make_command(name), name, f"{title}, post-trained to follow actions. From collected data.")
         for name, title in VIDEO.items()
     ),
 )

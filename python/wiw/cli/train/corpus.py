@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Trainings on a collected dataset: `wiw train pocket` and `wiw train NAME-action`."""
+"""Helpers of trainings on a collected dataset: `wiw train pocket` and `wiw train NAME-action`."""
 
 from __future__ import annotations
 
@@ -20,12 +20,12 @@ def require_data(name: str, data: Path | None, also: str = "") -> Path:
         ArgumentError: there is none.
     """
     if data is None:
-        raise ArgumentError(f"{name} trains on a dataset; give a folder of `wiw collect navigation`{also} by --data")
+        raise ArgumentError(f"{name} trains on a dataset; give a folder of `wiw collect navigation`{also} with --data")
     return data
 
 
 def describe_steps(card: Mapping[str, Any], batch: int) -> str:
-    """Return how long a training was, how it ended, and which weights were the best."""
+    """Describe a training: its length, how it ended, and which weights were best."""
     text = f"{card['trained_steps']:,} steps of {batch} clips, loss {card['loss']:.4f}"
     if "validation" not in card:
         return text

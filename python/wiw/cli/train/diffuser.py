@@ -21,7 +21,7 @@ def train_diffuser(
     epochs: Count = None,
     limits: Annotated[Limits, arg(name="")] = NO_LIMITS,
 ) -> int:
-    """Train diffuser, the 3D diffusion policy of manipulation, on demonstrations.
+    """Train diffuser, the 3D diffusion policy for manipulation, on demonstrations.
 
     $ wiw collect manipulation --episodes 120 --frames 16 --depth --wrist --seed 1 --out demos
     $ wiw train diffuser --demonstrations demos --out diffuser.safetensors
@@ -29,13 +29,13 @@ def train_diffuser(
 
     Training takes about half an hour on an idle core for 120 demonstrations of each task; repeat an interrupted command
     to resume it. One demonstration in twenty is held out. FILE also holds the recipe, and how often one of ten paths is
-    the expert's there. The weights that come with wiw were trained by these commands.
+    the expert's on these. The weights shipped with wiw were trained by these commands.
 
     Args:
-        out: Weights, a safetensors file.
-        demonstrations: Folder of `wiw collect manipulation --depth`. The policy learns to see by the wrist camera too
-            if they have its views (--wrist).
-        epochs: How often each sample is used, on average. Default: 40.
+        out: File for the weights (safetensors).
+        demonstrations: Folder of `wiw collect manipulation --depth`. The policy also learns to use the wrist camera if
+            they have its views (--wrist).
+        epochs: Number of epochs: how often each sample is used, on average. Default: 40.
         limits: Time limit and seed.
     """
     from wiw.policies.diffuser import require_torch
@@ -45,7 +45,7 @@ def train_diffuser(
     with write_weights("diffuser", out):
         if demonstrations is None:
             raise ArgumentError(
-                "diffuser trains on demonstrations; give a folder of `wiw collect manipulation --depth` by "
+                "diffuser trains on demonstrations; give a folder of `wiw collect manipulation --depth` with "
                 "--demonstrations"
             )
         from wiw.training.diffuser import Recipe

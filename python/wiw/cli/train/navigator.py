@@ -41,16 +41,16 @@ def train_navigator(
 
     Views of the scenes are rendered and cached first, so that an interrupted command does not render them again.
     Training takes 15 to 30 minutes on two idle cores; repeat an interrupted command to resume it. FILE also holds the
-    recipe, and how well the network tells near pairs of places of the val scenes from far ones and how far its bearings
-    are off, beside the matcher's similarity. The weights that come with wiw were trained for three of four epochs
+    recipe, and how well the network separates near pairs of places in the val scenes from far ones and the error of its
+    bearings, next to the matcher's similarity. The weights shipped with wiw were trained for three of four epochs
     (docs/navigation-tasks.md).
 
     Args:
-        out: Weights, a safetensors file.
+        out: File for the weights (safetensors).
         scenes: Training scenes: apartments:train[:N], a mesh, a Gazebo world or scans, as in `wiw run`.
-        val: Held-out scenes to measure it on; none may be trained on.
-        places: Places sampled in each scene; up to three more are sampled near each. Default: 24.
-        epochs: How often each sample is used, on average. Default: 4.
+        val: Held-out scenes for evaluation; none may be trained on.
+        places: Places sampled per scene; up to three more are sampled near each. Default: 24.
+        epochs: Number of epochs: how often each sample is used, on average. Default: 4.
         limits: Time limit and seed.
         preparation: How training data is prepared.
     """

@@ -33,22 +33,22 @@ def train_perception(
     limits: Annotated[Limits, arg(name="")] = NO_LIMITS,
     preparation: Annotated[Preparation, arg(name="")] = PREPARATION,
 ) -> int:
-    """Train the labeller of question answering: it gives each pixel of a view a category and a state (on or off, open
+    """Train the labeller for question answering: it gives each pixel of a view a category and a state (on or off, open
     or closed). Colour words are calibrated along with it.
 
     $ wiw train perception --out perception.safetensors
 
     Views of the scenes are rendered and cached first, so that an interrupted command does not render them again.
     Training takes one to two hours on two idle cores; repeat an interrupted command to resume it. FILE also holds the
-    recipe, and accuracy and IoU of categories, accuracy of states and of colour words on the val scenes. The weights
-    that come with wiw were trained for four epochs of a schedule that was first laid out for six (docs/perception.md).
+    recipe, accuracy and IoU of categories, and accuracy of states and of colour words on the val scenes. The weights
+    shipped with wiw were trained for four epochs of a schedule first laid out for six (docs/perception.md).
 
     Args:
-        out: Weights, a safetensors file; colour words go into a JSON file beside it.
+        out: File for the weights (safetensors); colour words go into a JSON file next to it.
         scenes: Training scenes: apartments:train[:N], a mesh, a Gazebo world or scans, as in `wiw run`.
-        val: Held-out scenes to measure it on; none may be trained on.
-        places: Places sampled in each scene. Default: 12.
-        epochs: How often each sample is used, on average. Default: 4.
+        val: Held-out scenes for evaluation; none may be trained on.
+        places: Places sampled per scene. Default: 12.
+        epochs: Number of epochs: how often each sample is used, on average. Default: 4.
         limits: Time limit and seed.
         preparation: How training data is prepared.
     """

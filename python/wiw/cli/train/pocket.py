@@ -36,8 +36,8 @@ def train_pocket(
     seed: Annotated[int, arg(metavar="N")] = 0,
     cache: Annotated[Path | None, arg(metavar="DIR", help_behavior_hint="")] = None,
 ) -> int:
-    """Train pocket, a world model of navigation: a small video diffusion model that draws all views of a plan together.
-    It starts from random weights.
+    """Train pocket, a world model for navigation: a small video diffusion model that generates all views of a plan
+    together. It starts from random weights.
 
     $ wiw collect navigation --scenes apartments:train:80 --out data
     $ wiw train pocket --data data --out pocket.safetensors
@@ -45,27 +45,27 @@ def train_pocket(
     $ wiw run imagenav --world-model pocket --world-model-option weights=pocket.safetensors
 
     Training takes two to three hours on two idle cores, less with --option clips=N. Repeat an interrupted command to
-    resume it; SIGUSR1 writes the checkpoint at once. FILE also holds the recipe, and PSNR on windows of the val scenes,
-    beside models that have learned nothing, and how much of it is lost under the places of another window. The weights
-    that come with wiw were trained on 16 800 clips.
+    resume it; SIGUSR1 writes the checkpoint at once. FILE also holds the recipe, PSNR on windows of the val scenes,
+    next to baselines without learning, and how much of it is lost when given another window's places. The weights
+    shipped with wiw were trained on 16 800 clips.
 
     Args:
         data: Dataset of `wiw collect navigation`.
-        out: Weights, a safetensors file.
-        val: Held-out scenes to measure it on; none may be trained on.
-        recipe: YAML file with numbers of the recipe, on top of the shipped ones.
-        option: Number of the recipe, such as rate=2e-5, clips=1600 or batch=8; may be given again. See
+        out: File for the weights (safetensors).
+        val: Held-out scenes for evaluation; none may be trained on.
+        recipe: YAML file that overrides values of the built-in recipe.
+        option: Override a value of the recipe, such as rate=2e-5, clips=1600 or batch=8; may be repeated. See
             `wiw.training.pocket.recipe.PocketRecipe`.
-        part: Part of the dataset: train leaves out one in twenty scenes for validation.
-        validation: Another dataset, of other scenes, to validate on while it trains: PSNR and SSIM after 1, 4, 8 and 14
-            actions, and the control gap. Default: the scenes that --part train leaves out.
-        decisions: File of `wiw collect decisions`, by which validation also measures how well the model's order of the
-            plans agrees with the true one.
-        tracker: Program that draws loss and validation; needs its package. OUT.log/metrics.jsonl has the same in any
-            case.
-        epochs: How often each clip is used, on average. Default: 1.
+        part: Part of the dataset to train on: train holds out one in twenty scenes for validation.
+        validation: Another dataset, with other scenes, for validation during training: PSNR and SSIM after 1, 4, 8 and
+            14 actions, and the control gap. Default: the scenes that --part train holds out.
+        decisions: File of `wiw collect decisions`, with which validation also measures how well the model's ranking of
+            the plans agrees with the true one.
+        tracker: Experiment tracker that plots loss and validation; requires its package. OUT.log/metrics.jsonl has the
+            same data in any case.
+        epochs: Number of epochs: how often each clip is used, on average. Default: 1.
         seed: Seed of the order of clips and of the weights.
-        cache: Folder of prepared training data; it can be deleted at any time. Default: $WIW_CACHE/looks.
+        cache: Folder for prepared training data, which can be deleted at any time. Default: $WIW_CACHE/looks.
     """
     from wiw.runs.part_options import parse_options
     from wiw.training.pocket.recipe import PocketRecipe
@@ -112,7 +112,7 @@ def _train(out: Path, data: Path, cache: Path, val: str, recipe: PocketRecipe, w
 
 
 def _check_held_out(val: str, data: NavigationData) -> None:
-    """Check that scenes are there and are not trained on; a dataset knows its scenes by name alone."""
+    """Check that scenes exist and are not trained on; a dataset identifies its scenes only by name."""
     from wiw.datasets.scene_splits import name_scene
     from wiw.scenes import resolve, strip_edits
 
@@ -120,8 +120,8 @@ def _check_held_out(val: str, data: NavigationData) -> None:
     shared = next((spec for spec in resolve(val) if strip_edits(name_scene(spec)) in trained), None)
     if shared is not None:
         raise ArgumentError(
-            f"--val: expected held-out scenes that are not trained on, got {shared}, and {data.folder} has a scene of "
-            "that name; choose others"
+            f"--val: expected held-out scenes, got {shared}, but {data.folder} has a scene of that name to train on; "
+            "choose others"
         )
 
 
@@ -133,4 +133,4 @@ def _report(card: Mapping[str, Any]) -> None:
             print(f"  {name:<28}" + "".join(f"{values[step]:8.1f}" for step in values))
         if found["gap"]:
             print(f"  {'control gap':<28}" + "".join(f"{value:8.1f}" for value in found["gap"].values()))
-    print("PSNR in dB of whole panoramas, weighted by latitude; the gap is what is lost when others' places are shown")
+    print("PSNR in dB of whole panoramas, weighted by latitude; the gap is the loss when given another window's places")

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Progress of a training: a bar in a terminal, a line a minute elsewhere."""
+"""Show the progress of a training: a bar in a terminal, one line per minute elsewhere."""
 
 from __future__ import annotations
 
@@ -11,15 +11,15 @@ from typing import Any
 from wiw.cli.bars import Bars
 
 LINE_SECONDS = 60.0
-"""Time between two lines of progress where the output is no terminal."""
+"""Seconds between progress lines if the output is not a terminal."""
 
 
 class TrainingProgress:
     """Steps, loss, speed and memory, with the time left.
 
     Args:
-        batch: number of units in a step.
-        unit: what speed is counted in.
+        batch: number of units per step.
+        unit: unit in which speed is counted.
     """
 
     def __init__(self, batch: int = 1, unit: str = "steps") -> None:
@@ -35,7 +35,7 @@ class TrainingProgress:
             self._bars.__exit__()
 
     def show_validation(self, step: int, found: Mapping[str, float]) -> None:
-        """Print what a validation found."""
+        """Print the results of a validation."""
         print(f"validation: step {step:,}, {describe_validation(found)}", file=sys.stderr, flush=True)
 
     def __call__(self, step: int, steps: int, loss: float) -> None:
@@ -67,7 +67,7 @@ def describe_validation(found: Mapping[str, float]) -> str:
         texts.append(f"gap of displacements {found['gap/displacements']:.2f} dB")
     if "rank" in found:
         texts.append(f"rank agreement {found['rank']:.2f}")
-    return ", ".join(texts) or "no clip leads anywhere"
+    return ", ".join(texts) or "no clip moves the camera"
 
 
 def track_items(items: Iterable[Any], text: str, total: int) -> Any:
@@ -79,7 +79,7 @@ def track_items(items: Iterable[Any], text: str, total: int) -> Any:
 
 
 def _describe_memory() -> str:
-    """Return the most memory used so far, of the GPU if there is one."""
+    """Describe the peak memory so far, of the GPU if there is one."""
     import resource
 
     import torch

@@ -26,7 +26,7 @@ def train_recogniser(
     limits: Annotated[Limits, arg(name="")] = NO_LIMITS,
     preparation: Annotated[Preparation, arg(name="")] = PREPARATION,
 ) -> int:
-    """Train the recogniser, the policy of Active Recognition: it names the object in a red box, given any number of
+    """Train the recogniser, the policy for Active Recognition: it names the object in a red box, given any number of
     real and imagined views of it.
 
     $ wiw train recogniser --out recogniser.safetensors
@@ -35,18 +35,18 @@ def train_recogniser(
 
     Views of the scenes are rendered and cached first, so that an interrupted command does not render them again.
     Training takes 15 to 30 minutes on two idle cores. FILE also holds the recipe, and accuracy and calibration error on
-    one half of the val scenes, after calibration on the other half. The weights that come with wiw were trained by an
+    one half of the val scenes, after calibration on the other half. The weights shipped with wiw were trained with an
     earlier recipe (docs/results.md).
 
     Args:
-        out: Weights, a safetensors file.
+        out: File for the weights (safetensors).
         scenes: Training scenes: apartments:train[:N], a mesh, a Gazebo world or scans, as in `wiw run`.
-        val: Held-out scenes; none may be trained on. They, or the samples of a single one, are split into halves for
+        val: Held-out scenes; none may be trained on. They, or the samples of a single scene, are split into halves for
             calibration and evaluation.
-        categories: What it tells apart. Default: the built-in list of 26 categories.
-        weights: File of this command to start from. Default: random weights.
-        places: Places sampled in each scene. Default: 8.
-        epochs: How often each sample is used, on average. Default: 25.
+        categories: Categories to distinguish. Default: the built-in list of 26.
+        weights: File written by this command to start from. Default: random weights.
+        places: Places sampled per scene. Default: 8.
+        epochs: Number of epochs: how often each sample is used, on average. Default: 25.
         limits: Time limit and seed.
         preparation: How training data is prepared.
     """
@@ -79,4 +79,4 @@ def _report(card: Mapping[str, Any], temperature: float) -> None:
             + (f", hard {100 * hard:5.1f} %" if hard is not None else "")
         )
     error = card["calibration_error"]
-    print(f"calibration error {error['before']:.3f}, at temperature {temperature:.2f} {error['after']:.3f}")
+    print(f"calibration error {error['before']:.3f}, {error['after']:.3f} at temperature {temperature:.2f}")

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Options and checks that the small networks share: they train in one process, on the CPU, into one file."""
+"""Options and checks shared by the small networks, which train in one process, on the CPU, into one file."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ from wiw.training.launcher import require_single_process
 
 VAL_SCENES = "apartments:val:20"
 Count = Annotated[int | None, arg(metavar="N", help_behavior_hint="")]
-"""A number that the recipe has where it is not given."""
+"""A number for which the recipe has a default."""
 
 
 def drop_none(options: Mapping[str, Any]) -> dict[str, Any]:
@@ -48,7 +48,7 @@ class Limits:
     """
 
     minutes: Annotated[float | None, arg(metavar="MIN")] = None
-    """Train fewer epochs if all of them would take longer than this."""
+    """Time limit in minutes: train fewer epochs if all of them would take longer."""
     seed: Annotated[int, arg(metavar="N")] = 0
     """Seed of the training data and of the weights."""
 
@@ -66,8 +66,8 @@ def write_weights(name: str, out: Path) -> Iterator[None]:
     """Train one network into a file: check that this can be done first, and report the file's size at the end.
 
     Raises:
-        ArgumentError: there are several processes, each of which would train alike and write the same file.
-        FileError: the file could not be written, which is found out before the minutes that training takes.
+        ArgumentError: there are several processes, which would all train the same way and write the same file.
+        FileError: the file cannot be written, which is checked before spending minutes on training.
     """
     require_single_process(name, "run the command without torchrun")
     _check_out(out)
@@ -80,9 +80,9 @@ def _check_out(out: Path) -> None:
     from wiw.errors import FileError
 
     if not out.absolute().parent.is_dir() or out.is_dir():
-        raise FileError(f"{out}: cannot be written; choose a file in a folder that exists by --out")
+        raise FileError(f"{out}: cannot be written; choose a file in an existing folder with --out")
 
 
 def to_percent(share: float | None) -> str:
-    """Return a share as text, "-" where there is none."""
+    """Return a share as text, "-" if there is none."""
     return "-" if share is None else f"{100 * share:.1f} %"

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""`wiw train NAME-action`: post-training of video generators and of NWM, a command each."""
+"""`wiw train NAME-action`: post-training of video generators and of NWM, one command each."""
 
 from __future__ import annotations
 
@@ -33,9 +33,9 @@ VIDEO: Mapping[str, str] = {
     "cosmos-predict2-action": "Cosmos-Predict2",
     "nwm-action": "Navigation World Models",
 }
-"""Pretrained models that are trained to follow actions: titles by name."""
+"""Pretrained models that can be post-trained to follow actions: titles by name."""
 RUN_AS: Mapping[str, str] = {"nwm-action": "nwm"}
-"""World models that have another name than they are trained by."""
+"""World models whose name differs from the name they are trained under."""
 ALSO_ARM = " or `wiw collect manipulation`"
 ONE_PROCESS = ProcessLayout()
 
@@ -81,7 +81,7 @@ def make_command(name: str) -> Callable[..., int]:
     return train_video
 
 
-HELP = """Post-train TITLE, with pretrained weights, to follow actions.
+HELP = """Post-train TITLE, starting from pretrained weights, to follow actions.
 
     $ wiw collect navigation --scenes apartments:train:80 --out data
     $ wiw train NAME --data data --out runs/mine
@@ -92,34 +92,34 @@ HELP = """Post-train TITLE, with pretrained weights, to follow actions.
     $ wiw train NAME --data data --cache latents --encode-only --engine ray --workers 8 --worker-gpus 1
     $ wiw train NAME --data data --cache latents --out runs/mine
 
-    It learns from a dataset of `wiw collect navigation` to follow an agent's actions or, but for nwm-action, from one
-    of `wiw collect manipulation` to follow poses of a gripper. This needs a GPU; docs/post-training.md explains recipes
-    and needs. Repeat an interrupted command to resume it; SIGUSR1 writes the checkpoint at once.
+    It learns to follow an agent's actions from a dataset of `wiw collect navigation` or, except for nwm-action, gripper
+    poses from one of `wiw collect manipulation`. This requires a GPU; docs/post-training.md explains recipes and
+    requirements. Repeat an interrupted command to resume it; SIGUSR1 writes the checkpoint at once.
 
     Args:
         data: Dataset of `wiw collect navigation` or `wiw collect manipulation`.
-        out: New folder of the checkpoint, or that of an interrupted training. Default: NAME.
-        weights: Pretrained weights: a folder as save_pretrained writes it, or a name on the Hugging Face hub. Default:
-            those of the world model.
-        recipe: YAML file with numbers of the recipe, on top of the shipped ones.
-        option: Number of the recipe, such as rate=2e-5, clips=1600 or batch=8; may be given again. See
+        out: Folder for the checkpoint: new, or that of an interrupted training. Default: NAME.
+        weights: Pretrained weights to start from: a folder written by save_pretrained, or a name on the Hugging Face
+            hub. Default: those of the world model.
+        recipe: YAML file that overrides values of the built-in recipe.
+        option: Override a value of the recipe, such as rate=2e-5, clips=1600 or batch=8; may be repeated. See
             `wiw.training.post_training.recipe.PostTrainingRecipe`.
-        device: Of torch. Default: the GPU if there is one.
-        part: Part of the dataset: train leaves out one in twenty scenes, or demonstrations, for validation.
-        validation: Another dataset, of other scenes or demonstrations, to validate on while it trains: PSNR and SSIM
-            after 1, 4, 8 and 14 actions, and the control gap. Default: those that --part train leaves out.
-        decisions: File of `wiw collect decisions`, by which validation of a model that moves also measures how well its
-            order of the plans agrees with the true one.
-        tracker: Program that draws loss and validation; needs its package. OUT.log/metrics.jsonl has the same in any
-            case.
-        epochs: How often each clip is used, on average. Default: 1.
+        device: Torch device. Default: the GPU if there is one.
+        part: Part of the dataset to train on: train holds out one in twenty scenes, or demonstrations, for validation.
+        validation: Another dataset, with other scenes or demonstrations, for validation during training: PSNR and SSIM
+            after 1, 4, 8 and 14 actions, and the control gap. Default: what --part train holds out.
+        decisions: File of `wiw collect decisions`, with which the validation of a model for navigation also measures
+            how well its ranking of the plans agrees with the true one.
+        tracker: Experiment tracker that plots loss and validation; requires its package. OUT.log/metrics.jsonl has the
+            same data in any case.
+        epochs: Number of epochs: how often each clip is used, on average. Default: 1.
         seed: Seed of the order of clips and of the weights.
-        cache: Folder of clips as the frozen networks encode them, for later epochs and other trainings. Default: none.
-        encode_only: Encode the clips of the training into --cache, and train nothing.
-        workers: Processes that encode clips for --encode-only. Default: 1.
-        place: Where they are; with engine ray, all machines see --data and --cache.
+        cache: Folder for clips as encoded by the frozen networks, for later epochs and other trainings. Default: none.
+        encode_only: Only encode the training clips into --cache; train nothing.
+        workers: Number of processes that encode clips for --encode-only. Default: 1.
+        place: Where these processes run; with engine ray, all machines must see --data and --cache.
         layout: Processes of the training.
-        dry_run: Print the command that runs on each machine, for several GPUs, and train nothing.
+        dry_run: For several GPUs: print the command to run on each machine; train nothing.
     """
 
 
@@ -134,25 +134,24 @@ def _post_train(
     layout: ProcessLayout,
     dry_run: bool,
 ) -> int:
-    """Post-train a model and print where its checkpoint is, or start several processes that do.
+    """Post-train a model and print where its checkpoint is, or start several processes that do so.
 
     Args:
         name: of the model.
         out: folder of the checkpoint.
         data: folder of the dataset.
         recipe: YAML file on top of the shipped recipe.
-        pairs: KEY=VALUE of the recipe, on top of both.
-        numbers: of the recipe that have flags of their own.
-        parts: which pretrained weights, on which device; part of the data; what it is validated on; folder of encoded
-            clips.
-        layout: how many processes, where.
-        dry_run: whether to print torchrun's command and to train nothing.
+        pairs: KEY=VALUE overrides of both.
+        numbers: values of the recipe that have their own flags.
+        parts: pretrained weights and device; part of the data; validation data; folder of encoded clips.
+        layout: how many processes run, and where.
+        dry_run: whether to print torchrun's command and train nothing.
 
     Returns:
-        The exit code: of the process that failed first if there are several.
+        The exit code; if there are several processes, that of the first one that failed.
 
     Raises:
-        ArgumentError: no data, or a recipe whose steps the processes cannot share out; see also
+        ArgumentError: no data, or a recipe whose steps cannot be split among the processes; see also
             `wiw.training.post_training.train.post_train`.
         DependencyError, InfrastructureError: see `wiw.training.launcher.submit_job`.
     """
@@ -212,7 +211,7 @@ def _encode(
 
     folder = require_data(name, data, ALSO_ARM)
     if cache is None:
-        raise ArgumentError("train: --encode-only writes encoded clips into a folder: name it with --cache")
+        raise ArgumentError("train: --encode-only writes encoded clips into a folder; name it with --cache")
     chosen, began = _choose_recipe(name, recipe, pairs, numbers, parts), time.monotonic()
     with announce_resume(), Bars() as bars:
 

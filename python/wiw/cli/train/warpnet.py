@@ -24,21 +24,21 @@ def train_warpnet(
     limits: Annotated[Limits, arg(name="")] = NO_LIMITS,
     preparation: Annotated[Preparation, arg(name="")] = PREPARATION,
 ) -> int:
-    """Train warpnet, a world model of navigation: it predicts the panorama that is seen from a place nearby.
+    """Train warpnet, a world model for navigation that predicts the panorama seen from a place nearby.
 
     $ wiw train warpnet --out warpnet.safetensors
     $ wiw run imagenav --world-model warpnet --world-model-option weights=warpnet.safetensors
 
     Walks through the scenes are rendered and cached first, so that an interrupted command does not render them again.
     Training takes 15 to 30 minutes on two idle cores. FILE also holds the recipe, and PSNR and SSIM on the val scenes,
-    beside copy and warp. The weights that come with wiw were trained by this command with its defaults.
+    next to copy and warp. The weights shipped with wiw were trained by this command with its defaults.
 
     Args:
-        out: Weights, a safetensors file.
+        out: File for the weights (safetensors).
         scenes: Training scenes: apartments:train[:N], a mesh, a Gazebo world or scans, as in `wiw run`.
-        val: Held-out scenes to measure it on; none may be trained on.
-        places: Walks recorded in each scene. Default: 24.
-        epochs: How often each sample is used, on average. Default: 6.
+        val: Held-out scenes for evaluation; none may be trained on.
+        places: Walks recorded per scene. Default: 24.
+        epochs: Number of epochs: how often each sample is used, on average. Default: 6.
         limits: Time limit and seed.
         preparation: How training data is prepared.
     """

@@ -16,7 +16,7 @@ def build_card(what: str, episodes: int, features: Mapping[str, Feature], fps: i
         what: "navigation" or "manipulation".
         episodes: their number.
         features: of their frames.
-        fps: frames a second.
+        fps: frames per second.
     """
     all_of = {**features, **INDICES}
     rows = "\n".join(f"| `{name}` | {each.dtype} {list(each.shape)} | {each.about} |" for name, each in all_of.items())

@@ -31,7 +31,7 @@ def export_lerobot(
     Args:
         folder: a finished collection.
         out: a new or empty folder, which has the dataset whole or not at all.
-        fps: frames a second, which timestamps are counted in; 5 for navigation and the mean rate of demonstrations if
+        fps: frames per second, which timestamps are counted in; 5 for navigation and the mean rate of demonstrations if
             None.
         workers: threads that encode pictures of navigation.
         progress: called after each episode.
@@ -60,7 +60,7 @@ def export_lerobot(
 
 
 def _count(episodes: Iterable[Episode], data: Sized, progress: Progress | None) -> Iterator[Episode]:
-    """Pass episodes on and tell how many are done."""
+    """Pass episodes on and report how many are done."""
     for done, episode in enumerate(episodes, 1):
         yield episode
         if progress is not None:

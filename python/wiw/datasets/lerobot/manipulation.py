@@ -59,7 +59,7 @@ def describe_features(manifest: Mapping[str, Any]) -> dict[str, Feature]:
 
 
 def estimate_rate(data: Demonstrations) -> int:
-    """Return the mean number of frames a second, rounded."""
+    """Return the mean number of frames per second, rounded."""
     times = [shard.read(index, ["seconds"]).column(0) for shard in data.files for index in range(len(shard))]
     seconds = sum(each[-1].as_py() for each in times)
     return max(1, round(sum(len(each) - 1 for each in times) / seconds)) if seconds else 1
@@ -162,5 +162,5 @@ def _encode_metres(depth: NDArray[np.float32]) -> bytes:
 def _decode_metres(encoded: bytes) -> NDArray[np.float32]:
     image = cv2.imdecode(np.frombuffer(encoded, np.uint8), cv2.IMREAD_UNCHANGED)
     if image is None or image.ndim != 2 or image.dtype != np.float32:
-        raise FileError("expected depth as TIFF of one float32 a pixel, got something else; copy the dataset again")
+        raise FileError("expected depth as TIFF with one float32 per pixel, got something else; copy the dataset again")
     return np.asarray(image, np.float32)

@@ -3,7 +3,7 @@
 
 LeRobot pairs a frame with the action that is taken in it, wiw with the one that led to it: actions move by a frame. The
 last frame of an episode has none, which is a motion of zero. Frames after turns, which wiw stores as a roll of another
-picture, get pictures of their own, equal to the rolled ones.
+picture, get separate pictures, equal to the rolled ones.
 """
 
 from __future__ import annotations

@@ -79,7 +79,7 @@ class LeRobotFolder:
         for name, feature in expected.items():
             got = found[name].get("dtype"), list(found[name].get("shape", ()))
             if got != (feature.dtype, list(feature.shape)):
-                hint = "; pictures of videos are no longer exact" if got[0] == "video" else ""
+                hint = "; images decoded from videos are no longer exact" if got[0] == "video" else ""
                 raise FileError(
                     f"{self.folder / INFO}: expected {name} as {feature.dtype} {list(feature.shape)}, got {got[0]} "
                     f"{got[1]}{hint}"
@@ -108,7 +108,9 @@ class LeRobotFolder:
                 self._check_frames(row, table, file.path)
                 columns = {key: _read_column(table.column(key), feature) for key, feature in features.items()}
                 if empty := [key for key, each in features.items() if each.is_image and None in columns[key]]:
-                    raise FileError(f"{file.path}: expected the pictures of {', '.join(empty)} in it, got some missing")
+                    raise FileError(
+                        f"{file.path}: expected the images of {', '.join(empty)} in it, but some are missing"
+                    )
                 yield Episode(row["tasks"][0], columns, {key: row[key] for key in facts})
 
     def _locate(self, row: Mapping[str, Any]) -> str:
@@ -160,7 +162,7 @@ class LeRobotFolder:
         if not isinstance(fps, int | float) or fps <= 0 or (np.abs(times - expected / fps) > TIME_TOLERANCE).any():
             rate = f"{(len(times) - 1) / times[-1]:g}" if times[-1] > 0 else "no"
             raise FileError(
-                f"{path}, episode {row['episode_index']}: expected {fps} frames a second as {INFO} says, got "
+                f"{path}, episode {row['episode_index']}: expected {fps} frames per second as {INFO} says, got "
                 f"timestamps of {rate}"
             )
 
@@ -175,7 +177,7 @@ class _DataFile:
         try:
             self._metadata = parquet.read_metadata(path)
         except FileNotFoundError as error:
-            raise FileError(f"{path} is missing; expected it, as meta/episodes says: copy the dataset again") from error
+            raise FileError(f"{path} is missing, although meta/episodes lists it: copy the dataset again") from error
         except (OSError, ArrowException) as error:
             raise self._build_damage_error(error) from error
         groups = range(self._metadata.num_row_groups)

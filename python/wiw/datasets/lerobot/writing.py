@@ -47,7 +47,7 @@ def write_dataset(
         out: a new or empty folder.
         episodes: taken one by one.
         features: of their columns.
-        fps: frames a second, which timestamps are counted in.
+        fps: frames per second, which timestamps are counted in.
         robot: name of the kind of robot.
         source: JSON-able: what importing needs beyond the episodes.
         card: text of README.md.
@@ -57,7 +57,7 @@ def write_dataset(
         FileError: the folder holds something already or cannot be written, or a picture of an episode is damaged.
     """
     if fps < 1:
-        raise ArgumentError(f"expected 1 frame a second or more, got {fps}")
+        raise ArgumentError(f"expected at least 1 frame per second, got {fps}")
     with atomic_folder(out) as folder:
         writer = _Writer(folder, features, fps)
         for episode in episodes:

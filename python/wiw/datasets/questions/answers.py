@@ -12,7 +12,7 @@ from wiw.datasets.questions.grammar import ACTIVITIES, CAPACITIES, HABITS, TEMPL
 Slots = Mapping[str, str]
 
 MATERIALS = {"wood planks": "wood", "wood parquet": "wood", "textile": "fabric", "enamel": "metal", "plant": ""}
-"""Words for materials that a table tells apart and nobody else does; "" is no answer."""
+"""Words for materials that a table distinguishes and nobody else does; "" is not an answer."""
 ON_STATES, OPEN_STATES = ("on", "off"), ("open", "closed")
 COUNTED = (
     "chair",
@@ -50,7 +50,7 @@ LOOKED_FOR = (
     "wardrobe",
     "washing machine",
 )
-"""Categories whose existence is asked for."""
+"""Categories whose existence is requested."""
 PLURAL = frozenset({"books", "candles", "kitchen utensils"})
 """Categories whose names are plurals: nothing is asked about what "the books" are like."""
 PATTERNED = frozenset({"books", "mirror", "picture", "window"})
@@ -97,15 +97,15 @@ class Fact:
     color: str = ""
     """Name of that colour."""
     gist: str = ""
-    """The part of the answer that answers are told apart by; the room of a place."""
+    """The part of the answer by which answers are distinguished; the room of a place."""
 
     @property
     def key(self) -> str:
-        """The part in which two answers must differ to be different."""
+        """The part in which two answers must differ to count as different."""
         return self.gist or self.answer
 
 
-def differ(first: Fact, second: Fact, answer_type: str) -> bool:
+def are_different(first: Fact, second: Fact, answer_type: str) -> bool:
     """Return whether two answers to one question are so different that none is a good guess at the other."""
     if answer_type == "color" and frozenset((first.answer, second.answer)) in CONFUSABLE:
         return False
@@ -113,7 +113,7 @@ def differ(first: Fact, second: Fact, answer_type: str) -> bool:
 
 
 def resemblance(guess: str, fact: Fact, answer_type: str) -> float:
-    """Return about how much a guess is worth, from 0 to 1 for the right answer."""
+    """Return about how close a guess is, from 0 to 1 for the right answer."""
     if guess == fact.answer:
         return 1.0
     if answer_type == "place":
@@ -126,7 +126,7 @@ def resemblance(guess: str, fact: Fact, answer_type: str) -> float:
 
 
 def find_answer(table: SceneTable, template: str, slots: Slots) -> Fact | None:
-    """Return what is true of a question in a scene, or None where it has no answer, or more than one."""
+    """Return what is true of a question in a scene, or None if it has no answer, or more than one."""
     if "room" in slots and (table.find_room(slots["room"]) is None or _may_be_elsewhere(table, slots)):
         return None
     fact = _ANSWERS[template](table, slots)
@@ -217,19 +217,19 @@ def _propose_rooms(table: SceneTable) -> Iterator[tuple[str, dict[str, str]]]:
 # -- answers by template -----------------------------------------------------------------------------------------------
 
 
-def _room(table: SceneTable, slots: Slots) -> Room | None:
+def _find_slot_room(table: SceneTable, slots: Slots) -> Room | None:
     return table.find_room(slots["room"]) if "room" in slots else None
 
 
 def _find_named(table: SceneTable, slots: Slots, slot: str = "object") -> Thing | None:
-    return table.find_one(slots[slot], _room(table, slots))
+    return table.find_one(slots[slot], _find_slot_room(table, slots))
 
 
 def _make_sight(thing: Thing, *others: Thing) -> tuple[Sight, ...]:
     return (Sight((thing.id, *(other.id for other in others))),)
 
 
-def _alone(found: list[Thing]) -> Thing | None:
+def _find_representative(found: list[Thing]) -> Thing | None:
     """Return the thing that stands for all of them: there is one, or they are of one category."""
     return found[0] if found and len({thing.category for thing in found}) == 1 else None
 
@@ -237,21 +237,21 @@ def _alone(found: list[Thing]) -> Thing | None:
 def _answer_by_relation(table: SceneTable, slots: Slots, find: Callable[[Thing], list[Thing]]) -> Fact | None:
     anchor = _find_named(table, slots, "anchor")
     found = find(anchor) if anchor is not None else []
-    thing = _alone(found)
+    thing = _find_representative(found)
     if anchor is None or thing is None:
         return None
     return Fact(thing.category, _make_sight(found[0], anchor), tuple(each.id for each in found))
 
 
-def _on_top(table: SceneTable, slots: Slots) -> Fact | None:
+def _answer_on_top(table: SceneTable, slots: Slots) -> Fact | None:
     return _answer_by_relation(table, slots, table.things_on)
 
 
-def _above(table: SceneTable, slots: Slots) -> Fact | None:
+def _answer_above(table: SceneTable, slots: Slots) -> Fact | None:
     return _answer_by_relation(table, slots, table.things_above)
 
 
-def _beside(table: SceneTable, slots: Slots) -> Fact | None:
+def _answer_beside(table: SceneTable, slots: Slots) -> Fact | None:
     def find(anchor: Thing) -> list[Thing]:
         if anchor.category not in FRONTED:
             return []
@@ -262,7 +262,7 @@ def _beside(table: SceneTable, slots: Slots) -> Fact | None:
     return _answer_by_relation(table, slots, find)
 
 
-def _color(table: SceneTable, slots: Slots) -> Fact | None:
+def _answer_color(table: SceneTable, slots: Slots) -> Fact | None:
     return _color_of(_find_named(table, slots))
 
 
@@ -272,12 +272,12 @@ def _color_of(thing: Thing | None) -> Fact | None:
     return Fact(thing.color, _make_sight(thing), (thing.id,), colored=thing.id, color=thing.color)
 
 
-def _floor_color(table: SceneTable, slots: Slots) -> Fact | None:
+def _answer_floor_color(table: SceneTable, slots: Slots) -> Fact | None:
     room = table.find_room(slots["room"])
     return _color_of(table.structure("floor", room)) if room else None
 
 
-def _wall_color(table: SceneTable, slots: Slots) -> Fact | None:
+def _answer_wall_color(table: SceneTable, slots: Slots) -> Fact | None:
     room = table.find_room(slots["room"])
     return _color_of(table.structure("wall", room)) if room else None
 
@@ -290,37 +290,37 @@ def _material_of(thing: Thing | None) -> Fact | None:
     return Fact(word, _make_sight(thing), (thing.id,), extra)
 
 
-def _material(table: SceneTable, slots: Slots) -> Fact | None:
+def _answer_material(table: SceneTable, slots: Slots) -> Fact | None:
     return _material_of(_find_named(table, slots))
 
 
-def _floor_material(table: SceneTable, slots: Slots) -> Fact | None:
+def _answer_floor_material(table: SceneTable, slots: Slots) -> Fact | None:
     room = table.find_room(slots["room"])
     return _material_of(table.structure("floor", room)) if room else None
 
 
-def _state(table: SceneTable, slots: Slots, states: tuple[str, str]) -> Fact | None:
+def _answer_state(table: SceneTable, slots: Slots, states: tuple[str, str]) -> Fact | None:
     thing = _find_named(table, slots)
     return Fact(thing.state, _make_sight(thing), (thing.id,)) if thing is not None and thing.state in states else None
 
 
-def _switch(table: SceneTable, slots: Slots) -> Fact | None:
-    return _state(table, slots, ON_STATES)
+def _answer_on_or_off(table: SceneTable, slots: Slots) -> Fact | None:
+    return _answer_state(table, slots, ON_STATES)
 
 
-def _opening(table: SceneTable, slots: Slots) -> Fact | None:
-    return _state(table, slots, OPEN_STATES)
+def _answer_open_or_closed(table: SceneTable, slots: Slots) -> Fact | None:
+    return _answer_state(table, slots, OPEN_STATES)
 
 
-def _is_state(table: SceneTable, slots: Slots) -> Fact | None:
+def _answer_is_state(table: SceneTable, slots: Slots) -> Fact | None:
     states = ON_STATES if slots["state"] in ON_STATES else OPEN_STATES
-    fact = _state(table, slots, states)
+    fact = _answer_state(table, slots, states)
     if fact is None:
         return None
     return Fact("yes" if fact.answer == slots["state"] else "no", fact.sights, fact.target)
 
 
-def _place(table: SceneTable, thing: Thing) -> Fact | None:
+def _answer_place(table: SceneTable, thing: Thing) -> Fact | None:
     """Return where a thing is: on or next to an anchor, in a room."""
     kind = table.kind_of(thing.room)
     if not kind:
@@ -335,12 +335,12 @@ def _place(table: SceneTable, thing: Thing) -> Fact | None:
     return Fact(answer, _make_sight(thing), (thing.id,), extra, gist=kind)
 
 
-def _where(table: SceneTable, slots: Slots) -> Fact | None:
+def _answer_where(table: SceneTable, slots: Slots) -> Fact | None:
     thing = table.find_one(slots["object"])
-    return _place(table, thing) if thing is not None else None
+    return _answer_place(table, thing) if thing is not None else None
 
 
-def _where_colored(table: SceneTable, slots: Slots) -> Fact | None:
+def _answer_where_colored(table: SceneTable, slots: Slots) -> Fact | None:
     category, color = slots["object"], slots["color"]
     all_of_it = table.find_all(category)
     alike = [each for each in all_of_it if each.color == color or frozenset((each.color, color)) in CONFUSABLE]
@@ -348,13 +348,13 @@ def _where_colored(table: SceneTable, slots: Slots) -> Fact | None:
         return None
     if category in PATTERNED:
         return None
-    fact = _place(table, alike[0])
+    fact = _answer_place(table, alike[0])
     if fact is None:
         return None
     return Fact(fact.answer, fact.sights, fact.target, fact.extra_answers, alike[0].id, color, fact.gist)
 
 
-def _which_room(table: SceneTable, slots: Slots) -> Fact | None:
+def _answer_which_room(table: SceneTable, slots: Slots) -> Fact | None:
     return _room_of(table, table.find_all(slots["object"]), exactly=True, category=slots["object"])
 
 
@@ -367,7 +367,7 @@ def _room_of(table: SceneTable, found: list[Thing], exactly: bool = False, categ
     return Fact(kind, _make_sight(found[0]), tuple(thing.id for thing in found)) if kind else None
 
 
-def _inside(room: Room, found: list[Thing], table: SceneTable) -> tuple[Sight, ...] | None:
+def _find_sights_in_room(room: Room, found: list[Thing], table: SceneTable) -> tuple[Sight, ...] | None:
     """Return what shows that these are all there is in a room: a place in it with all of them in view."""
     floor = table.structure("floor", room)
     if floor is None:
@@ -375,21 +375,21 @@ def _inside(room: Room, found: list[Thing], table: SceneTable) -> tuple[Sight, .
     return (Sight(tuple(thing.id for thing in found) or (floor.id,), room.name, around=True),)
 
 
-def _count_in(table: SceneTable, slots: Slots) -> Fact | None:
+def _answer_count_in_room(table: SceneTable, slots: Slots) -> Fact | None:
     room = table.find_room(slots["room"])
     found = table.find_all(slots["objects"], room) if room else []
-    sights = _inside(room, found, table) if room and found else None
+    sights = _find_sights_in_room(room, found, table) if room and found else None
     return Fact(str(len(found)), sights, tuple(thing.id for thing in found)) if sights else None
 
 
-def _exists(table: SceneTable, slots: Slots) -> Fact | None:
+def _answer_exists(table: SceneTable, slots: Slots) -> Fact | None:
     room = table.find_room(slots["room"])
     found = table.find_all(slots["object"], room) if room else []
-    sights = _inside(room, found[:1], table) if room else None
+    sights = _find_sights_in_room(room, found[:1], table) if room else None
     return Fact("yes" if found else "no", sights, tuple(thing.id for thing in found)) if sights else None
 
 
-def _count_around(table: SceneTable, slots: Slots) -> Fact | None:
+def _answer_count_around(table: SceneTable, slots: Slots) -> Fact | None:
     anchor = _find_named(table, slots, "anchor")
     if anchor is None or slots["objects"] not in ("chair",):
         return None
@@ -400,7 +400,7 @@ def _count_around(table: SceneTable, slots: Slots) -> Fact | None:
     return Fact(str(len(near)), (Sight((anchor.id, *ids), anchor.room, around=True),), (anchor.id, *ids))
 
 
-def _count_on(table: SceneTable, slots: Slots) -> Fact | None:
+def _answer_count_on(table: SceneTable, slots: Slots) -> Fact | None:
     anchor = _find_named(table, slots, "anchor")
     found = table.things_on(anchor) if anchor is not None else []
     if anchor is None or not found or anchor.category in ("bookshelf",):
@@ -409,8 +409,8 @@ def _count_on(table: SceneTable, slots: Slots) -> Fact | None:
     return Fact(str(len(found)), (Sight((anchor.id, *ids), anchor.room, around=True),), (anchor.id, *ids))
 
 
-def _nearer(table: SceneTable, slots: Slots) -> Fact | None:
-    room = _room(table, slots)
+def _answer_nearer(table: SceneTable, slots: Slots) -> Fact | None:
+    room = _find_slot_room(table, slots)
     things = [table.find_one(slots[name], room) for name in ("object", "first", "second")]
     if len({slots[name] for name in ("object", "first", "second")}) < 3:
         return None
@@ -425,7 +425,7 @@ def _nearer(table: SceneTable, slots: Slots) -> Fact | None:
     return Fact(nearer.category, (sight,), (thing.id, first.id, second.id))
 
 
-def _activity(table: SceneTable, slots: Slots) -> Fact | None:
+def _answer_activity(table: SceneTable, slots: Slots) -> Fact | None:
     found = [thing for word in ACTIVITIES[slots["activity"]] for thing in table.find_all(word)]
     if not found or len({thing.room for thing in found}) != 1:
         return None
@@ -437,16 +437,16 @@ def _activity(table: SceneTable, slots: Slots) -> Fact | None:
     return Fact(f"at the {thing.category} in the {kind}", _make_sight(thing), ids, extra, gist=kind)
 
 
-def _use(table: SceneTable, slots: Slots) -> Fact | None:
+def _answer_use(table: SceneTable, slots: Slots) -> Fact | None:
     room = table.find_room(slots["room"])
     found = [thing for word in USES[slots["use"]] for thing in table.find_all(word, room)] if room else []
-    thing = _alone(found)
+    thing = _find_representative(found)
     if room is None or thing is None:
         return None
     return Fact(thing.category, (Sight((thing.id,), room.name),), tuple(dict.fromkeys(each.id for each in found)))
 
 
-def _count_rooms(table: SceneTable, slots: Slots) -> Fact | None:
+def _answer_count_rooms(table: SceneTable, slots: Slots) -> Fact | None:
     rooms = [room for room in table.rooms if room.kind == slots["rooms"]]
     if (
         slots["rooms"] not in ROOM_SIGNS
@@ -461,18 +461,18 @@ def _count_rooms(table: SceneTable, slots: Slots) -> Fact | None:
     return Fact(str(len(rooms)), tuple(Sight((each,)) for each in ids), ids)
 
 
-def _sleepers(table: SceneTable, slots: Slots) -> Fact | None:
+def _answer_sleeping_places(table: SceneTable, slots: Slots) -> Fact | None:
     beds = table.find_all("bed")
     if not 0 < len(beds) <= MOST_STOPS or any(
-        1.15 < _width(bed) < 1.4 for bed in beds
+        1.15 < _measure_width(bed) < 1.4 for bed in beds
     ):  # wide for one and narrow for two
         return None
-    count = sum(2 if bed.category == "bunk bed" or _width(bed) >= 1.4 else 1 for bed in beds)
+    count = sum(2 if bed.category == "bunk bed" or _measure_width(bed) >= 1.4 else 1 for bed in beds)
     ids = tuple(bed.id for bed in beds)
     return Fact(str(count), tuple(Sight((each,)) for each in ids), ids)
 
 
-def _capacity(table: SceneTable, slots: Slots) -> Fact | None:
+def _answer_capacity(table: SceneTable, slots: Slots) -> Fact | None:
     found = table.find_all(CAPACITIES[slots["capacity"]])
     if not 0 < len(found) <= MOST_STOPS:
         return None
@@ -480,39 +480,39 @@ def _capacity(table: SceneTable, slots: Slots) -> Fact | None:
     return Fact(str(len(found)), tuple(Sight((each,)) for each in ids), ids)
 
 
-def _width(bed: Thing) -> float:
+def _measure_width(bed: Thing) -> float:
     return float(sorted((bed.high - bed.low)[[0, 2]])[0])
 
 
-def _habit(table: SceneTable, slots: Slots) -> Fact | None:
+def _answer_habit(table: SceneTable, slots: Slots) -> Fact | None:
     return _room_of(table, [thing for word in HABITS[slots["habit"]] for thing in table.find_all(word)])
 
 
 _ANSWERS: Mapping[str, Callable[[SceneTable, Slots], Fact | None]] = {
-    "on_top": _on_top,
-    "above": _above,
-    "beside": _beside,
-    "floor_color": _floor_color,
-    "wall_color": _wall_color,
-    "color": _color,
-    "floor_material": _floor_material,
-    "material": _material,
-    "switch": _switch,
-    "opening": _opening,
-    "is_state": _is_state,
-    "where": _where,
-    "where_colored": _where_colored,
-    "which_room": _which_room,
-    "count_in": _count_in,
-    "count_around": _count_around,
-    "count_on": _count_on,
-    "exists": _exists,
-    "nearer": _nearer,
-    "activity": _activity,
-    "use": _use,
-    "count_rooms": _count_rooms,
-    "sleepers": _sleepers,
-    "capacity": _capacity,
-    "seats": lambda table, slots: _count_around(table, {**slots, "objects": "chair"}),
-    "habit": _habit,
+    "on_top": _answer_on_top,
+    "above": _answer_above,
+    "beside": _answer_beside,
+    "floor_color": _answer_floor_color,
+    "wall_color": _answer_wall_color,
+    "color": _answer_color,
+    "floor_material": _answer_floor_material,
+    "material": _answer_material,
+    "switch": _answer_on_or_off,
+    "opening": _answer_open_or_closed,
+    "is_state": _answer_is_state,
+    "where": _answer_where,
+    "where_colored": _answer_where_colored,
+    "which_room": _answer_which_room,
+    "count_in": _answer_count_in_room,
+    "count_around": _answer_count_around,
+    "count_on": _answer_count_on,
+    "exists": _answer_exists,
+    "nearer": _answer_nearer,
+    "activity": _answer_activity,
+    "use": _answer_use,
+    "count_rooms": _answer_count_rooms,
+    "sleepers": _answer_sleeping_places,
+    "capacity": _answer_capacity,
+    "seats": lambda table, slots: _answer_count_around(table, {**slots, "objects": "chair"}),
+    "habit": _answer_habit,
 }

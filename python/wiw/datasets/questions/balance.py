@@ -5,7 +5,7 @@ Scenes are taken in blocks of four, in the order given, and a block's questions 
 scenes of the block, or in a scene and its twin, with different answers. So in every run each text occurs in two scenes
 at least, no answer of a text is right more than half of the time, and half of the yes-no questions are answered by yes.
 A block's episodes depend on its own scenes only, and pairs stay together: the first N episodes are the same however
-many are asked for, and every even N has the property.
+many are requested, and every even N has the property.
 """
 
 from __future__ import annotations
@@ -19,7 +19,7 @@ import numpy as np
 
 from wiw import scenes as scene_specs
 from wiw._core import core
-from wiw.datasets.questions.answers import differ, resemblance
+from wiw.datasets.questions.answers import are_different, resemblance
 from wiw.datasets.questions.blind import blind_answer
 from wiw.datasets.questions.facts import make_table
 from wiw.datasets.questions.generate import DEFAULT_RULES, Answerable, Backend, EpisodeRules, questions_of
@@ -38,7 +38,7 @@ TWIN_TRIES = 6
 SPARE = 2
 """Questions that a scene may have beyond its share, so that the last pairs of a block can be found."""
 FAMILIES = {"floor_material": "material", "which_room": "where"}
-"""Templates that take one turn with another, which asks for the same."""
+"""Templates that alternate with another one that asks the same."""
 
 Pair = tuple[Answerable, Answerable]
 
@@ -115,7 +115,7 @@ class _Tally:
         self.counts.update(_answer(each) for each in pair)
         self.targets.update((_home(each), each.fact.target[0]) for each in pair if each.fact.target)
 
-    def excess(self, pair: Pair, rules: EpisodeRules) -> float:
+    def compute_excess(self, pair: Pair, rules: EpisodeRules) -> float:
         """Return what guessing from the text is worth for a pair, 0 where its category can do with such a pair."""
         worth = [guess_value(each) for each in self.pairs if each[0].category == pair[0].category]
         value = guess_value(pair)
@@ -171,7 +171,7 @@ def _candidates(pools: Mapping[str, Sequence[Answerable]], key: int) -> list[Pai
         pair
         for questions in by_text.values()
         for pair in combinations(questions, 2)
-        if differ(pair[0].fact, pair[1].fact, pair[0].answer_type)
+        if are_different(pair[0].fact, pair[1].fact, pair[0].answer_type)
     ]
     return [pairs[i] for i in np.argsort(core.uniform(key, len(pairs)), kind="stable")]
 
@@ -194,7 +194,7 @@ def _next_pair(
         category = pair[0].category
         return (
             tally.counts[category],
-            tally.excess(pair, rules),
+            tally.compute_excess(pair, rules),
             tally.counts[_family(pair[0])],
             repeated,
             sum(answers),

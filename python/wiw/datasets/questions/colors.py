@@ -27,7 +27,7 @@ _HUES = (
 )
 _SIZE = (160, 188)
 LEAST_PIXELS = 20
-"""Fewer say nothing of a colour."""
+"""Fewer are not enough to name a colour."""
 
 
 def name_colors(pixels: NDArray[np.uint8]) -> NDArray[np.str_]:
@@ -67,7 +67,7 @@ _TO_OKLAB = np.array(
 def name_rendered_color(
     world: World, instance: int, viewpoints: list[Viewpoint], share: float, exposures: Sequence[float] = (1.0,)
 ) -> str:
-    """Return the name of an instance's colour as rendered from some viewpoints; empty where it has no clear one.
+    """Return the name of an instance's colour as rendered from some viewpoints; empty if it has no clear one.
 
     It is clear where at least `share` of its pixels are of that name, from each viewpoint, and so is their mean, and
     would be if it were brighter by the factors in `exposures`.

@@ -45,7 +45,7 @@ BROADER = {
 }
 """Categories that a shorter word may mean as well: "the chair" is no one thing beside an office chair."""
 PASSAGES = {"hall": "hallway", "corridor": "hallway"}
-"""Rooms that nobody would tell apart by name."""
+"""Rooms that nobody would distinguish by name."""
 
 
 UNCLEAR = "?"
@@ -118,7 +118,7 @@ class SceneTable:
         return kinds
 
     def find_room(self, kind: str) -> Room | None:
-        """Return the only room of a kind; None where there is none, or more than one."""
+        """Return the only room of a kind; None if there is none, or more than one."""
         rooms = self.room_kinds.get(kind, [])
         return rooms[0] if len(rooms) == 1 else None
 
@@ -197,9 +197,9 @@ class SceneTable:
         for thing in self.furniture(anchor.room):
             if thing is anchor:
                 continue
-            gap = _least(thing, across) - _greatest(anchor, across)
-            overlap = min(_greatest(thing, anchor.front), _greatest(anchor, anchor.front)) - max(
-                _least(thing, anchor.front), _least(anchor, anchor.front)
+            gap = _find_lowest(thing, across) - _find_highest(anchor, across)
+            overlap = min(_find_highest(thing, anchor.front), _find_highest(anchor, anchor.front)) - max(
+                _find_lowest(thing, anchor.front), _find_lowest(anchor, anchor.front)
             )
             if -0.15 <= gap <= reach and overlap > 0.1:
                 found.append((gap, thing.id, thing))
@@ -224,7 +224,7 @@ class SceneTable:
 
 
 def make_table(scene: Scene, name: str = "") -> SceneTable:
-    """Return the table of a scene, which is empty of rooms where the scene does not tell them.
+    """Return the table of a scene, which has no rooms where the scene does not define them.
 
     Instances of a scan that have no surface are left out.
     """
@@ -232,11 +232,11 @@ def make_table(scene: Scene, name: str = "") -> SceneTable:
         Room(room["name"], PASSAGES.get(room["type"], room["type"]), *np.asarray(room["bounds"], np.float64))
         for room in scene.rooms
     )
-    things = tuple(_thing(instance) for instance in scene.instances if instance["triangle_count"])
+    things = tuple(_build_thing(instance) for instance in scene.instances if instance["triangle_count"])
     return SceneTable(name or scene.name, things, rooms)
 
 
-def _thing(instance: dict[str, object]) -> Thing:
+def _build_thing(instance: dict[str, object]) -> Thing:
     attributes = instance["attributes"]
     assert isinstance(attributes, dict)
     low, high = np.asarray(instance["bounds"], np.float64)
@@ -261,14 +261,14 @@ def _is_over(thing: Thing, other: Thing, margin: float = 0.03) -> bool:
     return bool((middle[axes] >= other.low[axes] - margin).all() and (middle[axes] <= other.high[axes] + margin).all())
 
 
-def _corners(thing: Thing) -> NDArray[np.float64]:
+def _list_corners(thing: Thing) -> NDArray[np.float64]:
     xs, zs = (thing.low[0], thing.high[0]), (thing.low[2], thing.high[2])
     return np.array([[x, 0.0, z] for x in xs for z in zs])
 
 
-def _least(thing: Thing, axis: NDArray[np.float64]) -> float:
-    return float((_corners(thing) @ axis).min())
+def _find_lowest(thing: Thing, axis: NDArray[np.float64]) -> float:
+    return float((_list_corners(thing) @ axis).min())
 
 
-def _greatest(thing: Thing, axis: NDArray[np.float64]) -> float:
-    return float((_corners(thing) @ axis).max())
+def _find_highest(thing: Thing, axis: NDArray[np.float64]) -> float:
+    return float((_list_corners(thing) @ axis).max())

@@ -38,22 +38,22 @@ class EpisodeRules:
     """Rules that a question and its start satisfy. Lengths in metres."""
 
     shortest: float = 4.0
-    """Least L*, the walk from the start to the nearest place from which the question can be answered."""
+    """Minimum L*, the walk from the start to the nearest place from which the question can be answered."""
     longest: float = 15.0
     share: float = 0.003
-    """Least part of a view that target and anchor fill at such a place."""
+    """Minimum part of a view that target and anchor fill at such a place."""
     counted: float = 0.001
     """The same for each of several things that need not be in one view, such as those that are counted."""
     reach: float = 4.0
     """Greatest distance of such a place from the target."""
     clear: float = 0.5
-    """Least share of a thing's pixels that are rendered in the colour that a question speaks of."""
+    """Minimum share of a thing's pixels that are rendered in the colour that a question speaks of."""
     rooms: int = 6
-    """Least number of rooms of an apartment, passages included; there is nothing to explore in smaller ones."""
+    """Minimum number of rooms of an apartment, passages included; there is nothing to explore in smaller ones."""
     places: int = 320
     """Places looked at in a scene."""
     viewpoints: int = 24
-    """Most places that an episode names as those from which it can be answered."""
+    """Maximum number of places that an episode names as those from which it can be answered."""
     yes_no: float = 0.2
     """Greatest share of questions that are answered by yes or no; half of these by yes."""
     guessing: float = 0.2
@@ -203,12 +203,12 @@ def look_around(
     points: NDArray[np.float64] | None = None,
     attributes: Attributes = NO_ATTRIBUTES,
 ) -> Surroundings:
-    """Survey a scene, from places of its own or those of another one like it.
+    """Survey a scene, from its own places or those of a similar one.
 
-    The rooms of a scene that does not tell them are found by what is in them (`mesh_table`); `attributes` says more.
+    The rooms of a scene that does not define any are found by what is in them (`mesh_table`); `attributes` says more.
 
     Raises:
-        ArgumentError: no rooms are found; attributes of instances that are not there.
+        ArgumentError: no rooms are found; attributes of instances that do not exist.
     """
     table = make_table(place.scene, place.name)
     if points is None:
@@ -218,8 +218,9 @@ def look_around(
         table = observe_table(place, views, attributes, rules.clear)
     if not table.rooms:
         raise ArgumentError(
-            f"{place.name}: expected a scene that tells its rooms, such as apartments:val/3, or whose instances have "
-            "names that give rooms away, such as bed and stove; other questions come from a file (episode_file=...)"
+            f"{place.name}: expected a scene with rooms, such as apartments:val/3, or one whose instances have names "
+            "from which rooms can be inferred, such as bed and stove; for other scenes give questions in a file "
+            "(episode_file=...)"
         )
     return Surroundings(place, table, views, rules, seed)
 
@@ -270,7 +271,7 @@ def generate(
         free = [each for each in pool if each.text not in texts and _within_limits(each, made, rules)]
         if not free:
             raise ArgumentError(
-                f"{world.name}: only {len(made)} of {count} questions satisfy {rules}; ask for fewer in a scene"
+                f"{world.name}: only {len(made)} of {count} questions satisfy {rules}; request fewer per scene"
             )
         chosen = min(
             free,

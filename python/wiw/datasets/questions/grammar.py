@@ -83,7 +83,7 @@ CAPACITIES: Mapping[str, str] = {
     "read by a floor lamp": "floor lamp",
     "look into a mirror": "mirror",
 }
-"""Activities for which each of several people needs a thing of their own."""
+"""Activities for which each of several people needs one thing."""
 
 _RESERVED = "above are around can does home how in is it left many nearer of off on open closed or people right the to"
 _TOKEN = rf"(?!(?:{'|'.join(_RESERVED.split())})\b)[a-z0-9]+"
@@ -113,7 +113,7 @@ _PLURALS = ("objects", "rooms")
 
 @dataclass(frozen=True)
 class Template:
-    """One kind of question. What stands in brackets is left out where its slot is not filled."""
+    """One kind of question. Text in brackets is left out where its slot is not filled."""
 
     name: str
     category: str
@@ -202,19 +202,23 @@ def phrase(template: str, slots: Mapping[str, str]) -> str:
         if re.fullmatch(_SLOTS.get(name, _THING), word) is None or (
             name in _PLURALS and singular(plural(word)) != word
         ):
-            raise ArgumentError(f"slot {name} of '{template}': '{word}' cannot be told from the words around it")
+            raise ArgumentError(
+                f"slot {name} of '{template}': '{word}' cannot be distinguished from the words around it"
+            )
     words = {name: plural(word) if name in _PLURALS else word for name, word in slots.items()}
     text = re.sub(r"\[(.*?{(\w+)}.*?)\]", lambda part: part[1] if part[2] in words else "", kind.pattern)
     text = text.format(**words)
     text = re.sub(r"\ba (?=[aeiou])", "an ", text)
     found = parse(text)
     if found is None or found.template != template or found.slots != dict(slots):
-        raise ArgumentError(f"'{text}' does not mean '{template}' with {dict(slots)} alone; use other words")
+        raise ArgumentError(
+            f"'{text}' is ambiguous: it does not only mean '{template}' with {dict(slots)}; use other words"
+        )
     return text
 
 
 def parse(text: str) -> ParsedQuestion | None:
-    """Return template and words of a text, or None where it is none of this language."""
+    """Return template and words of a text, or None if it is not in this language."""
     plain = " ".join(text.lower().split()).rstrip(" ?") + "?"
     for name, template in TEMPLATES.items():
         match = _regex(name).fullmatch(plain)

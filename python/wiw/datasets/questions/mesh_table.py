@@ -1,6 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The scene table of a scene that tells nothing but names: categories from these, colours from renders, rooms by
-`room_plan`, states and materials from nowhere, and all of it overridden by a file where there is one.
+"""The scene table of a scene that gives nothing but names: categories from these, colours from renders, rooms by
+`room_plan`, states and materials from nowhere, and all of it overridden by a file if there is one.
 """
 
 from __future__ import annotations
@@ -38,8 +38,6 @@ EXPOSURES = (0.85, 1.0, 1.18)
 """Brightness at which a colour must have one name: whether a thing in dim light is white or grey, nobody could say."""
 LOOKS = 4
 """Views in which a thing's colour must have one name."""
-
-Overlay = Mapping[str, Mapping[str, str]]
 
 
 @dataclass(frozen=True)
@@ -88,7 +86,7 @@ def _read_fields(name: str, fields: Any) -> tuple[tuple[str, str], ...]:
 
 
 def observe_table(world: World, survey: Survey, attributes: Attributes, clear: float) -> SceneTable:
-    """Return the table of a scene as its names and renders tell it.
+    """Return the table of a scene according to its names and renders.
 
     Args:
         world: the scene.
@@ -140,7 +138,8 @@ def _read_room(name: str, kind: str, rooms: Sequence[Room]) -> str:
     if len(fit) != 1:
         known = ", ".join(sorted(room.kind for room in rooms)) or "none"
         raise ArgumentError(
-            f"attributes: {name}: room: expected a kind of which the scene has one room, of {known}; got '{kind}'"
+            f"attributes: {name}: room: expected a kind that exactly one room of the scene has, of {known}; got "
+            f"'{kind}'"
         )
     return fit[0]
 

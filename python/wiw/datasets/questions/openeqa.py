@@ -30,7 +30,7 @@ SOURCE = "open-eqa"
 PATH_LENGTHS = "gt_path_length.json"
 """Name of the published file of metres by question id, each the length of a recorded tour of the scene."""
 ENDINGS = (".glb", ".basis.glb", ".gltf", ".obj", ".ply", ".dae")
-"""How a scene's file may end, the first one first."""
+"""Suffixes of a scene's file, in order of preference."""
 NEAR = 0.5
 """Metres from a start to the navigation mesh beyond which it is off it."""
 _PLACES = 64
@@ -64,7 +64,7 @@ def load(path: str | Path, scenes: str | Path = "", path_lengths: str | Path | N
         other = first.setdefault(episode.episode_id, i)
         if other != i:
             raise FileError(
-                f"{where}: question_id '{episode.episode_id}' is that of item {other}, too; expected its own"
+                f"{where}: question_id '{episode.episode_id}' is also that of item {other}; expected a unique one"
             )
         found.append(episode)
     if not scenes:
@@ -122,7 +122,7 @@ def _question(item: Mapping[str, Any]) -> Question:
 
 
 def _type_of(answer: str) -> str:
-    """Return the kind of a free answer, where rules can tell."""
+    """Return the kind of a free answer, where rules can decide it."""
     plain = answer.lower().strip(" .!")
     return "yes_no" if plain in ("yes", "no") else "count" if plain.isdecimal() else "text"
 
@@ -192,6 +192,6 @@ def locate_start(world: World, episode: Episode) -> Episode:
         raise FileError(
             f"episode {episode.episode_id}: start_position {to_position(start)} is not on the navigation mesh of "
             f"{world.name}; the nearest place, {to_position(nearest)}, is {away:.2f} m away, expected at most {NEAR} "
-            "m: is this the scene of the question?"
+            "m: is this the right scene?"
         )
     return replace(episode, start_position=to_position(nearest))

@@ -39,7 +39,7 @@ class Question:
     extra_answers: tuple[str, ...] = ()
     """Other answers that are as right."""
     template: str = ""
-    """Name of the template in `grammar.TEMPLATES`; empty where a person wrote the question."""
+    """Name of the template in `grammar.TEMPLATES`; empty if a person wrote the question."""
     slots: Mapping[str, str] = field(default_factory=dict)
     """Words that fill the template."""
     target: tuple[int, ...] = ()

@@ -1,10 +1,10 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Rooms of a scene that tells none: what walls keep apart, named by the furniture that gives rooms away.
+"""Rooms of a scene that defines none: what walls keep apart, named by the furniture that gives rooms away.
 
 A gap between the ends of two walls in one line, up to a few metres wide, is a doorway. Floor that walls and doorways
 close off is one room if it has signs of one room in it, such as a bed. With signs of several, as in an open plan, it is
-of the room whose sign is clearly nearest on foot. Other floor, and what stands there, is in no room: nobody could say
-in which.
+of the room whose sign is clearly nearest on foot. Other floor, and whatever stands there, is in no room: nobody could
+say in which.
 """
 
 from __future__ import annotations
@@ -69,7 +69,7 @@ class RoomPlan:
     origin: NDArray[np.float64]
     """float64 [2]: x and z where the first column and row begin."""
     labels: NDArray[np.int32]
-    """int32 [rows, columns]: number of the room, from 1 on; 0 where there is none, or nobody could say which."""
+    """int32 [rows, columns]: number of the room, from 1 on; 0 if there is none, or nobody could say which."""
     kinds: tuple[str, ...]
     """Kind of each room, by number - 1."""
 

@@ -93,7 +93,7 @@ def survey(world: World, points: NDArray[np.float64]) -> Survey:
 
 
 def place_key(seed: int, scene: str) -> int:
-    """Return the key that places of a scene are drawn with; of a file whatever folder it lies in."""
+    """Return the key that places of a scene are drawn with; of a file, whatever folder it is in."""
     name = scene if is_generated(scene) else Path(scene).name
     return core.fold_key([seed, 0xAE0A, *name.encode()])
 

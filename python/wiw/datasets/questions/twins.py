@@ -6,7 +6,6 @@ Who answers both rightly has looked; no prior of homes, and no memory of the apa
 
 from __future__ import annotations
 
-import re
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 
@@ -14,7 +13,7 @@ import numpy as np
 
 from wiw import scenes
 from wiw._core import core
-from wiw.datasets.questions.answers import differ, find_answer
+from wiw.datasets.questions.answers import are_different, find_answer
 from wiw.datasets.questions.facts import SceneTable, make_table
 from wiw.datasets.questions.generate import Answerable, Backend, EpisodeRules, look_around
 from wiw.datasets.questions.survey import choose_places, place_key
@@ -22,6 +21,7 @@ from wiw.datasets.worlds import World, world
 from wiw.errors import ArgumentError
 from wiw.nav import Ground, NavMesh
 from wiw.render import Renderer
+from wiw.scenes.specs import parse_single
 
 KINDS = ("color", "state", "remove", "swap")
 TRIES = 4
@@ -68,7 +68,7 @@ def find_twin(
     Copies are looked at without their light, which takes seconds to bake, unless the question is about a colour.
     """
     key = place_key(seed, question.scene)
-    hopeful = list(_hopeful(question, table, edits))
+    hopeful = list(_find_changing_edits(question, table, edits))
     draws = core.uniform(core.fold_key([key, 0x7F1A, *question.text.encode()]), len(hopeful))
     points = None
     for i in np.argsort(draws, kind="stable")[:TRIES]:
@@ -77,7 +77,7 @@ def find_twin(
         if points is None:
             points = choose_places(world(question.scene, backend), rules.places, key)
         twin = look_around(copy, seed, rules, points).ask(question.template, question.slots, question.start)
-        if twin is not None and differ(question.fact, twin.fact, question.answer_type):
+        if twin is not None and are_different(question.fact, twin.fact, question.answer_type):
             return replace(twin, start_position=question.start_position)
     return None
 
@@ -90,24 +90,21 @@ def open_unlit(spec: str, backend: Backend) -> World:
 
 def outline(spec: str) -> scenes.Scene:
     """Return an apartment's scene without its light."""
-    base, _, edits = spec.partition("?")
-    match = re.fullmatch(scenes.APARTMENTS, base)
-    if match is None or match[4] is None:
-        raise ArgumentError(f"scene spec '{spec}': expected a single apartment, such as apartments:val/7")
-    return scenes.apartment_table(int(match[4]), match[1], edits=edits.split("&") if edits else ())
+    seed, split, edits = parse_single(spec)
+    return scenes.apartment_table(seed, split, edits=edits)
 
 
 def may_have_twin(question: Answerable, table: SceneTable, edits: Sequence[Edit]) -> bool:
     """Return whether some edit changes the answer of a question; where it can be seen from is another matter."""
-    return next(_hopeful(question, table, edits), None) is not None
+    return next(_find_changing_edits(question, table, edits), None) is not None
 
 
-def _hopeful(question: Answerable, table: SceneTable, edits: Sequence[Edit]) -> Iterator[Edit]:
+def _find_changing_edits(question: Answerable, table: SceneTable, edits: Sequence[Edit]) -> Iterator[Edit]:
     """Yield the edits of what a question is about that change its answer."""
     names = {thing.name for thing in table.things if thing.id in question.fact.target}
     for edit in edits:
         if not names & set(edit.names) or (edit.kind == "color" and not question.fact.colored):
             continue
         fact = find_answer(make_table(outline(f"{question.scene}?{edit.text}")), question.template, question.slots)
-        if fact is not None and differ(question.fact, fact, question.answer_type):
+        if fact is not None and are_different(question.fact, fact, question.answer_type):
             yield edit

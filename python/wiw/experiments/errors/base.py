@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Errors of imagined futures, and how one of a known dose is written: KIND@DOSE, such as `blur@16`."""
+"""Errors in imagined futures, and the notation for one of a known dose: KIND@DOSE, such as `blur@16`."""
 
 from __future__ import annotations
 
@@ -17,13 +17,13 @@ from wiw.world_models.base import WorldModel
 
 Family = Literal["looks", "flicker", "control", "content"]
 _PURPOSE = 0x6572726F
-"""Keeps these draws apart from all others of a rollout."""
+"""Separates these draws from all other draws of a rollout."""
 
 
 class Degradation(ABC):
-    """An error of imagined futures, of a known dose. A dose of 0 changes nothing.
+    """An error of a known dose in imagined futures. A dose of 0 changes nothing.
 
-    All draws are by the seed of a rollout, and nested: what a dose does, a larger one does too.
+    All draws are derived from the rollout's seed, and are nested: what a dose changes, a larger one changes too.
 
     Args:
         dose: from 0, in `unit`.
@@ -35,7 +35,7 @@ class Degradation(ABC):
     kind: ClassVar[str]
     family: ClassVar[Family]
     about: ClassVar[str]
-    """A sentence that begins with a verb: what a dose does to a future."""
+    """What a dose does to a future, as a sentence that begins with a verb."""
     unit: ClassVar[str]
     """Unit of the dose."""
     doses: ClassVar[Mapping[str, tuple[float, ...]]]
@@ -43,9 +43,9 @@ class Degradation(ABC):
     most: ClassVar[float] = np.inf
     """Largest dose."""
     draws_future: ClassVar[bool] = False
-    """Whether something is drawn for a whole future, so that futures cannot share the frames of a common beginning."""
+    """Whether something is drawn once per future, so that futures cannot share the frames of a common beginning."""
     needs_simulator: ClassVar[bool] = True
-    """Whether it acts on the fork of the simulator that only the oracle is handed."""
+    """Whether it acts on the simulator's fork, which only the oracle is given."""
 
     def __init__(self, dose: float) -> None:
         if not 0 <= dose <= self.most:
@@ -69,7 +69,7 @@ class Degradation(ABC):
     def misplace(self, simulator: object, actions: NDArray[np.generic], seed: int) -> NDArray[np.float64]:
         """Return how far each frame is from where it should have been taken, float64 [K, 2]: metres and degrees.
 
-        Of the camera in plans of primitives, of the gripper in plans of poses. Default: nowhere else.
+        This concerns the camera in plans of primitives, the gripper in plans of poses. Default: no displacement.
 
         Args:
             simulator: fork of the environment from which the plan is imagined.
@@ -86,5 +86,5 @@ def per_space(primitives: tuple[float, ...], poses: tuple[float, ...] | None = N
 
 
 def make_generator(seed: int, *parts: int) -> np.random.Generator:
-    """Return the generator of a rollout's draws; `parts` tell several of one rollout apart."""
+    """Return the generator of a rollout's draws; `parts` distinguish several of one rollout."""
     return np.random.Generator(np.random.Philox(key=core.fold_key([int(seed), _PURPOSE, *parts])))

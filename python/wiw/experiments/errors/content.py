@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Errors of content: the right place and looks, but things are missing, elsewhere, invented, or walls are open.
+"""Errors of content: the right place and looks, but objects are missing, moved or invented, or walls are open.
 
-They act on what is drawn, never on what happens: the simulator's own forks, physics included, stay true. Light that is
-baked into textures stays as it is.
+They affect only what is rendered, never what happens: the simulator's own forks, physics included, stay true. Light
+that is baked into textures is unchanged.
 """
 
 from __future__ import annotations
@@ -28,16 +28,16 @@ from wiw.types import GRIPPER_POSES, Conditioning, Control
 from wiw.world_models.base import WorldModel
 
 BARRIERS = frozenset({"wall", "door", "door frame", "window"})
-"""Categories that a hallucination of free space leaves out."""
+"""Categories left out by hallucinated free space."""
 AROUND = 4.0
-"""Metres from the agent within which things are invented."""
+"""Distance from the agent in metres within which objects are invented."""
 TABLE_AREA = ((-0.1, 0.4), (-0.4, 0.4))
 """Metres in x and y between which things are invented on a table."""
 
 
 @dataclass(frozen=True)
 class DrawnFork:
-    """Stands in for a fork of the simulator: its world is drawn otherwise, and cameras may go elsewhere."""
+    """Stands in for a fork of the simulator whose world is rendered differently, and whose cameras may be elsewhere."""
 
     renderer: Any
     find_cameras: Any
@@ -49,7 +49,7 @@ class DrawnFork:
 
 
 class ContentDegradation(Degradation):
-    """An error of what is there."""
+    """An error in what exists."""
 
     family = "content"
     draws_future = True
@@ -61,7 +61,7 @@ class ContentDegradation(Degradation):
         controls: Sequence[Control],
         seeds: NDArray[np.uint64],
     ) -> NDArray[np.uint8]:
-        """Return what the oracle sees of a world that is drawn with this error."""
+        """Return what the oracle sees of a world that is rendered with this error."""
         assert observations.simulators is not None
         draw = self.draw_table if model.accepts.space == GRIPPER_POSES else self.draw_world
         pairs = zip(observations.simulators, seeds, strict=True)
@@ -78,11 +78,11 @@ class ContentDegradation(Degradation):
 
 
 class Missing(ContentDegradation):
-    """Things that are not there."""
+    """Some objects are missing."""
 
     kind = "missing"
-    about = "Leaves things out, each drawn for itself: furniture and small things, or what is on a table."
-    unit = "share of the things"
+    about = "Leaves out random objects: furniture and small things, or what is on a table."
+    unit = "share of the objects"
     doses = per_space((0.25, 0.5, 1.0))
     most = 1.0
 
@@ -100,10 +100,10 @@ class Missing(ContentDegradation):
 
 
 class Moved(ContentDegradation):
-    """Things that are elsewhere."""
+    """Objects are in the wrong place."""
 
     kind = "moved"
-    about = "Moves every thing horizontally, each in a direction of its own, through whatever is there."
+    about = "Moves every object horizontally, each in its own direction, through whatever is there."
     unit = "metres"
     doses = per_space((0.25, 0.5, 1.0), (0.03, 0.1, 0.3))
 
@@ -126,11 +126,11 @@ class Moved(ContentDegradation):
 
 
 class Invented(ContentDegradation):
-    """Things that do not exist."""
+    """Objects appear that do not exist."""
 
     kind = "invented"
-    about = "Shows copies of things of the scene where there are none, on free floor within 4 m or on the table."
-    unit = "copies per thing of the scene"
+    about = "Shows copies of the scene's objects where there are none, on free floor within 4 m or on the table."
+    unit = "copies per object of the scene"
     doses = per_space((0.25, 0.5, 1.0))
     most = 1.0
 
@@ -164,10 +164,7 @@ class OpenSpace(ContentDegradation):
     """Hallucinated free space."""
 
     kind = "open"
-    about = (
-        "Leaves out the walls, doors and windows of rooms, each drawn for itself, and goes on where a step is blocked, "
-        "drawn for each step."
-    )
+    about = "Leaves out random walls, doors and windows of rooms, and at random moves on where a step is blocked."
     unit = "share of the walls, doors and windows, and of the blocked steps"
     doses = per_space((0.25, 0.5, 1.0), ())
     most = 1.0
@@ -179,7 +176,7 @@ class OpenSpace(ContentDegradation):
         return DrawnFork(hidden.renderer, lambda actions: self._find_cameras(fork, actions, seed))
 
     def draw_table(self, bench: Any, seed: int) -> DrawnBench:
-        """Refuse: there are no walls around a table."""
+        """Raise an error: there are no walls around a table."""
         raise ArgumentError("error 'open': a table has no walls; expected plans of primitives")
 
     def misplace(self, simulator: Any, actions: NDArray[Any], seed: int) -> NDArray[np.float64]:
@@ -234,7 +231,7 @@ def _list_instances(scene: Any, words: str, belongs: Any) -> Instances:
     found = [each for each in drawn if each["category"] and belongs(each["category"])]
     if not found:
         raise ArgumentError(
-            f"scene {scene.name} has no {words} that could be drawn otherwise; expected a scene whose instances have "
+            f"scene {scene.name} has no {words} that could be changed; expected a scene whose instances have "
             "categories, such as a generated apartment"
         )
     low, high = scene.bounds

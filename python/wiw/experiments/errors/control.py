@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Errors of control: true views, but not of where the plan leads. The oracle executes another plan in its fork.
+"""Errors of control: true views, but not from where the plan leads. The oracle executes a different plan in its fork.
 
 In plans of primitives the camera is moved in the world of the episode, under its rule for blocked moves, by strides of
 any length; the turns that a plan begins with are real views and stay as they are. In plans of poses the gripper is sent
@@ -32,7 +32,7 @@ Poses = NDArray[np.float64]
 
 
 class MotionDegradation(Degradation):
-    """An error of the motion that is imagined."""
+    """An error in the imagined motion."""
 
     family = "control"
 
@@ -43,7 +43,7 @@ class MotionDegradation(Degradation):
         controls: Sequence[Control],
         seeds: NDArray[np.uint64],
     ) -> NDArray[np.uint8]:
-        """Return what the oracle truly sees where this error leads it."""
+        """Return what the oracle truly sees where this error takes it."""
         if model.accepts.space == GRIPPER_POSES:
             pairs = zip(controls, seeds, strict=True)
             changed = [replace(own, ids=self._send_gripper(own.ids, int(seed))) for own, seed in pairs]
@@ -65,7 +65,7 @@ class MotionDegradation(Degradation):
         return np.stack([off, np.zeros(len(off))], axis=1)
 
     def find_camera_poses(self, fork: WorldFork, actions: NDArray[np.int8], seed: int) -> NDArray[np.float64]:
-        """Return the cameras that a plan is imagined from, float64 [K, 4, 4]."""
+        """Return the cameras from which a plan is imagined, float64 [K, 4, 4]."""
         if not len(actions):
             return np.empty((0, 4, 4))
         walker = Walker(fork)
@@ -76,16 +76,16 @@ class MotionDegradation(Degradation):
 
     @abstractmethod
     def change_moves(self, moves: Moves, generator: np.random.Generator) -> Moves:
-        """Return the moves that are imagined in place of a plan's."""
+        """Return the moves that are imagined instead of the plan's."""
 
     @abstractmethod
     def change_poses(self, poses: Poses, generator: np.random.Generator) -> Poses:
-        """Return the poses that are imagined in place of a plan's; the first one stays."""
+        """Return the poses that are imagined instead of the plan's; the first one is unchanged."""
 
 
 @dataclass(frozen=True)
 class _ErrantFork:
-    """Stands in for a fork of the simulator: another plan than the one asked for is executed."""
+    """Stands in for a fork of the simulator, and executes a different plan than the requested one."""
 
     fork: WorldFork
     error: MotionDegradation
@@ -109,8 +109,8 @@ class Scale(MotionDegradation):
     """Motion that leads too far."""
 
     kind = "scale"
-    about = "Makes each stride and each turn longer, and each way of a gripper."
-    unit = "share of the true length that is added"
+    about = "Makes each step, each turn and each gripper motion longer."
+    unit = "added share of the true length"
     doses = per_space((0.5, 1.0, 2.0), (0.25, 0.5, 1.0))
 
     def change_moves(self, moves: Moves, generator: np.random.Generator) -> Moves:
@@ -128,8 +128,8 @@ class Direction(MotionDegradation):
     """Motion to one side."""
 
     kind = "direction"
-    about = "Turns each stride to one side of its heading, and each way of a gripper about the vertical."
-    unit = "degrees; to which side is drawn for each future"
+    about = "Turns each step to one side of its heading, and each gripper motion about the vertical."
+    unit = "degrees; the side is random for each future"
     doses = per_space((30.0, 90.0, 180.0), (10.0, 30.0, 90.0))
     most = 180.0
     draws_future = True
@@ -152,10 +152,10 @@ class Direction(MotionDegradation):
 
 
 class Lag(MotionDegradation):
-    """Frames that are behind the plan."""
+    """Frames that lag behind the plan."""
 
     kind = "lag"
-    about = "Shows after each action what followed an earlier one."
+    about = "Shows after each action the frame that followed an earlier one."
     unit = "actions"
     doses = per_space((1.0, 2.0, 4.0), (1.0, 2.0, 3.0))
 
@@ -177,7 +177,7 @@ class Drift(MotionDegradation):
 
     kind = "drift"
     about = "Shifts the camera, or the gripper, sideways with every action."
-    unit = "metres per action; the direction is drawn for each future"
+    unit = "metres per action; the direction is random for each future"
     doses = per_space((0.05, 0.1, 0.2), (0.02, 0.05, 0.1))
     draws_future = True
 
@@ -197,7 +197,7 @@ class Ignored(MotionDegradation):
     """Actions without effect."""
 
     kind = "ignored"
-    about = "Leaves out actions, each drawn for itself: nothing moves then."
+    about = "Ignores random actions: nothing moves after them."
     unit = "share of the actions"
     doses = per_space((0.25, 0.5, 1.0))
     most = 1.0

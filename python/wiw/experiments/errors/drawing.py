@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Pictures of a world that is drawn otherwise than it is: instances elsewhere, or copies of them beside the originals.
+"""Render a world differently than it is: with instances elsewhere, or copies of them in addition to the originals.
 
-Everything that draws a scene shares its renderer, so instances are moved for the time of one call and then put back.
+Everything that renders a scene shares its renderer, so instances are moved during one call and then put back.
 """
 
 from __future__ import annotations

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""World models whose futures have an error of a known dose."""
+"""World models with an error of a known dose in their futures."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ from wiw.world_models.base import Accepts, WorldModel
 
 
 class ErroneousModel(ModelWrapper):
-    """A world model whose rollouts have an error."""
+    """A world model with an error in its rollouts."""
 
     def __init__(self, model: WorldModel, error: Degradation) -> None:
         super().__init__(model)
@@ -33,7 +33,7 @@ class ErroneousModel(ModelWrapper):
 
     @property
     def accepts(self) -> Accepts:  # type: ignore[override]
-        """The model's; futures that draw something of their own share no frames."""
+        """The model's declaration; if something is drawn once per future, futures share no frames."""
         own = self.model.accepts
         return replace(own, causal=False) if self.error.draws_future and self.error.dose else own
 
@@ -42,7 +42,7 @@ class ErroneousModel(ModelWrapper):
         return {**super().describe(), "error": str(self.error)}
 
     def fingerprint(self) -> str:
-        """Return nothing: what is cached are the rollouts of the model itself."""
+        """Return nothing, as only the rollouts of the model itself are cached."""
         return ""
 
     def rollout(
@@ -57,7 +57,7 @@ class ErroneousModel(ModelWrapper):
 
 
 class Erroneous(ModelImaginer):
-    """Asks a world model to imagine the plans, and lets the futures have an error.
+    """Asks a world model to imagine the plans, and adds an error to the futures.
 
     Args:
         model: any for errors of looks and flicker; the oracle for those that act in the simulator.
@@ -82,7 +82,7 @@ class Erroneous(ModelImaginer):
         return MisplacedImagination(super().imagine(forked), forked, self.error)
 
     def _fork(self, key: Any, shown: ModelInput) -> Any:
-        """Return a fork of an episode's simulator; of one in which an agent walks, with its world."""
+        """Return a fork of an episode's simulator, together with its world if an agent walks in it."""
         env = self._environments.find(key)
         fork = env.fork() if shown.simulator is None else shown.simulator
         if self.accepts.space != PRIMITIVES or not self.error.needs_simulator:
@@ -90,13 +90,13 @@ class Erroneous(ModelImaginer):
         if not isinstance(env, NavigationEnv):
             raise ArgumentError(
                 f"error '{self.error}' moves the camera in the episode's world: expected an environment of "
-                f"wiw.envs.NavigationEnv, got {type(env).__name__}; run it by wiw.evaluate"
+                f"wiw.envs.NavigationEnv, got {type(env).__name__}; run it with wiw.evaluate"
             )
         return WorldFork(fork, env.state.world, env.task.motion == "slide")
 
 
 class MisplacedImagination(ImaginationWrapper):
-    """Imagined futures that know how far from their places the frames were taken."""
+    """Imagined futures that know how far from the right places their frames were taken."""
 
     def __init__(self, inner: Imagination, request: Request, error: Degradation) -> None:
         super().__init__(inner)
@@ -129,7 +129,7 @@ class MisplacedImagination(ImaginationWrapper):
 
 
 def require_error(error: Degradation, space: str, has_simulator: bool) -> None:
-    """Require that an error makes sense for plans of a space and a world model.
+    """Check that an error makes sense for plans of a space and a world model.
 
     Raises:
         ArgumentError: it does not; says why.
@@ -140,6 +140,6 @@ def require_error(error: Degradation, space: str, has_simulator: bool) -> None:
         )
     if error.needs_simulator and not has_simulator:
         raise ArgumentError(
-            f"error '{error.kind}' acts in the simulator that only the oracle is handed: expected error-{error}, "
-            "without another model; blur, noise, tint, resolution and flicker go with any"
+            f"error '{error.kind}' acts in the simulator, which only the oracle is given: expected error-{error}, "
+            "without another model; blur, noise, tint, resolution and flicker work with any model"
         )

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Errors of looks: every frame shows the right place, but not as it looks. They go with any world model."""
+"""Errors of looks: every frame shows the right place, but looks wrong. They work with any world model."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ Image = NDArray[np.uint8]
 
 
 class FrameDegradation(Degradation):
-    """An error of single frames."""
+    """An error in single frames."""
 
     needs_simulator = False
 
@@ -36,7 +36,7 @@ class FrameDegradation(Degradation):
         controls: Sequence[Control],
         seeds: NDArray[np.uint64],
     ) -> NDArray[np.uint8]:
-        """Return the model's frames, each of them changed but for frame 0."""
+        """Return the model's frames, each changed except frame 0."""
         frames = np.array(model.rollout(observations, controls, seeds))
         panorama = model.accepts.view == "panorama"
         for row, control, seed in zip(frames, controls, seeds, strict=True):
@@ -61,7 +61,7 @@ class Blur(FrameDegradation):
 
     kind = "blur"
     family = "looks"
-    about = "Blurs each frame by a Gaussian."
+    about = "Blurs each frame with a Gaussian."
     unit = "standard deviation in pixels of a frame 1024 wide"
     doses = per_space((4.0, 16.0, 64.0))
 
@@ -81,8 +81,8 @@ class Resolution(FrameDegradation):
 
     kind = "resolution"
     family = "looks"
-    about = "Shrinks each frame and enlarges it again, by areas and by linear interpolation."
-    unit = "side of a pixel in pixels of a frame 1024 wide, less one"
+    about = "Downsamples each frame by area averaging and upsamples it by linear interpolation."
+    unit = "side of a low-resolution pixel, in pixels of a frame 1024 wide, minus one"
     doses = per_space((7.0, 31.0, 127.0))
 
     def degrade(self, frame: Image, seed: int, index: int, panorama: bool) -> Image:
@@ -98,7 +98,7 @@ class Noise(FrameDegradation):
 
     kind = "noise"
     family = "looks"
-    about = "Adds Gaussian noise to each channel of each pixel of a frame 1024 wide, drawn anew for each frame."
+    about = "Adds Gaussian noise, independent for each frame, to each channel of each pixel of a frame 1024 wide."
     unit = "standard deviation in grey levels of 255"
     doses = per_space((10.0, 40.0, 120.0))
 
@@ -113,7 +113,7 @@ class Tint(FrameDegradation):
 
     kind = "tint"
     family = "looks"
-    about = "Adds one colour to all pixels of a future, drawn from all directions in RGB."
+    about = "Adds one colour, in a random direction of RGB, to all pixels of a future."
     unit = "length of the colour in grey levels of 255"
     doses = per_space((15.0, 40.0, 100.0))
     draws_future = True
@@ -125,11 +125,11 @@ class Tint(FrameDegradation):
 
 
 class Flicker(FrameDegradation):
-    """Frames that do not go together, as if each were generated with a seed of its own."""
+    """Frames that are inconsistent, as if each were generated with its own seed."""
 
     kind = "flicker"
     family = "flicker"
-    about = "Adds soft patches of colour, 16 across, to each frame, drawn anew for each."
+    about = "Adds soft patches of random colour, 16 across, to each frame independently."
     unit = "standard deviation in grey levels of 255"
     doses = per_space((8.0, 20.0, 60.0))
 

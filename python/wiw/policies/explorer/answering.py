@@ -71,7 +71,7 @@ def _locate(home: Home, categories: Sequence[str]) -> tuple[MapObject, ...]:
 def _measure_confidence(
     question: ParsedQuestion, fact: Fact, things: Sequence[MapObject], home: Home, grid: OccupancyGrid
 ) -> float:
-    """Return how sure an answer is: by how well its things were seen, and how much of the place is known."""
+    """Return how sure an answer is: from how well its things were seen, and how much of the place is known."""
     sure = min((measure_clarity(thing) for thing in things), default=0.6)
     if question.answer_type == "state":
         sure *= min((thing.state_share for thing in things), default=0.0)

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""How sure an answer is: its support by the map, as the share of answers so supported that are right."""
+"""The confidence of an answer: its support by the map, as the share of answers so supported that are right."""
 
 from __future__ import annotations
 

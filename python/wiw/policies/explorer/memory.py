@@ -40,7 +40,7 @@ class Memory:
     """The memory of one episode."""
 
     question: ParsedQuestion | None
-    """None where the text is none of the generator's language: then only the blind answer is left."""
+    """None if the text is not in the generator's language: then only the blind answer is left."""
     objects: ObjectMap
     grid: OccupancyGrid = field(default_factory=OccupancyGrid)
     surfaces: list[Surface] = field(default_factory=list)

@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """Presuppositions of a question: that what it speaks of is there, once, and in the room it names.
 
-A map has a thing twice, or two rooms that might be the kitchen; the question knows better. It says nothing of the
+A map has a thing twice, or two rooms that might be the kitchen; the question knows better. It does not reveal the
 answer.
 """
 
@@ -31,14 +31,14 @@ LEAST_KIND = 0.02
 
 def find_likeliest(home: Home, question: ParsedQuestion) -> Fact | None:
     """Return the best supported answer to a question: what hinders one is left out, the weakest first."""
-    for table in _doubt(home, question, presume(home, question)):
+    for table in _drop_weak_things(home, question, assume_named_things(home, question)):
         fact = find_answer(table, question.template, question.slots)
         if fact is not None:
             return fact
     return None
 
 
-def presume(home: Home, question: ParsedQuestion) -> SceneTable:
+def assume_named_things(home: Home, question: ParsedQuestion) -> SceneTable:
     """Return the table of a home with one room of the kind that a question names, and one of each thing it names."""
     table = home.table
     kind = question.slots.get("room")
@@ -85,7 +85,7 @@ def _keep_one(home: Home, table: SceneTable, category: str, room: Room | None) -
     return replace(table, things=(*(thing for thing in table.things if thing.id not in rivals), best))
 
 
-def _doubt(home: Home, question: ParsedQuestion, table: SceneTable) -> Iterator[SceneTable]:
+def _drop_weak_things(home: Home, question: ParsedQuestion, table: SceneTable) -> Iterator[SceneTable]:
     """Yield the table, then without what else things may stand on, then with ever fewer weakly supported things."""
     yield table
     anchor = table.find_one(question.slots.get("anchor", ""))

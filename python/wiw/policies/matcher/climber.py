@@ -6,7 +6,7 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from wiw.policies.matcher import HEADINGS, Matcher, Memory
+from wiw.policies.matcher.policy import HEADINGS, Matcher, Memory
 
 NEIGHBOURHOOD = 1.5
 """Metres within which remembered places inform about the slope here."""
@@ -15,7 +15,7 @@ RIDGE = 0.3
 
 
 class Climber(Matcher):
-    """Estimates from real observations what a world model would imagine: in which direction the match improves.
+    """Estimates from real observations what a world model would imagine: the direction in which the match improves.
 
     Its score without a world model is the fair baseline for the question whether imagination was needed at all.
     """

@@ -22,7 +22,7 @@ SMOOTHING = 1.0
 PEAK_GAP = 1.2
 """Metres around a peak in which no other is taken."""
 LEAST_LOG = -2.5
-"""Least logarithm of a likelihood ratio: no place is so sure that others could not overrule it."""
+"""Minimum logarithm of a likelihood ratio: no place is so sure that others could not overrule it."""
 
 
 @dataclass(frozen=True)

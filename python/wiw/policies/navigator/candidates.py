@@ -65,7 +65,7 @@ def list_candidates(
         way_map: the same, coarser, with what may be floor.
         ways: from where the agent stands, one row.
         pose: x, y, azimuth of the agent.
-        targets: cells of the way map; those to which there is no way are left out.
+        targets: cells of the way map; those that cannot be reached are left out.
         horizon: L.
     """
     floor = crop_floor(grid, pose, (horizon + LEEWAY) * STEP)

@@ -48,7 +48,7 @@ class PlaceEstimates:
 
 
 class GoalEstimator:
-    """A network, asked about a place at a time, so that no estimate depends on the other places of a batch.
+    """A network, applied to one place at a time, so that no estimate depends on the other places of a batch.
 
     Args:
         network: the trained network.

@@ -16,7 +16,7 @@ from torch import Tensor, nn
 from torch.nn import functional
 
 HEADINGS = 32
-"""Directions that bearings are told apart by; 0 is the back of the panorama, as its columns are."""
+"""Directions into which bearings are divided; 0 is the back of the panorama, as its columns are."""
 GOAL_COLUMNS = 8
 ROWS = 8
 DISTANCES = (0.5, 1.0, 1.5, 2.0, 3.0, 4.0, 5.5, 7.5)

@@ -28,14 +28,14 @@ OCTILE = 0.96
 
 @dataclass(frozen=True)
 class Ways:
-    """The shortest ways from N places to all cells."""
+    """The shortest paths from N places to all cells."""
 
     metres: NDArray[np.float64]
-    """float64 [N, cells]; inf where there is none."""
+    """float64 [N, cells]; inf if there is none."""
     azimuths: NDArray[np.float64]
     """float64 [N, cells]: direction in which it begins, straight to its first bend, in the frame of the start."""
     before: NDArray[np.int32]
-    """int32 [N, cells]: the cell before each, itself where there is none."""
+    """int32 [N, cells]: the cell before each, itself if there is none."""
     cells: WayCells
 
     def take(self, rows: slice) -> Ways:
@@ -56,7 +56,7 @@ class WayMap:
         """bool [rows, columns]: what may be floor."""
 
     def measure_ways(self, places: NDArray[np.float64]) -> Ways:
-        """Measure the ways from places [N, 2], which lie on the map, to all cells."""
+        """Measure the shortest paths from places [N, 2], which must be on the map, to all cells."""
         sources = self.cells.find(places)
         metres, before = csgraph.dijkstra(
             self._build_graph(sources), directed=True, indices=sources, return_predecessors=True

@@ -53,7 +53,7 @@ class TargetSighting:
 
 
 def locate_in_view(mask: Mask, depth: NDArray[np.float32]) -> TargetSighting | None:
-    """Estimate the target's position from its mask [H, W] and the depth; None where it is out of sight."""
+    """Estimate the target's position from its mask [H, W] and the depth; None if it is out of sight."""
     box = find_box(mask, wraps=True)
     if box is None:
         return None
@@ -97,7 +97,7 @@ def rank_headings(seen: TargetSighting | None, bearing: float, side: int) -> lis
     """Return directions in which a better view is likely, the best first.
 
     Args:
-        seen: the present sighting; None where the target is out of sight.
+        seen: the present sighting; None if the target is out of sight.
         bearing: the target's direction, or its last known one.
         side: the side on which it was passed before, 0 if on none yet.
     """

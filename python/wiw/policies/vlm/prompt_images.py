@@ -24,13 +24,13 @@ Image = NDArray[np.uint8]
 
 
 def render_observation(observation: Observation, side: int | None = None) -> tuple[Image, Image]:
-    """Return front view, of so many pixels a side, and panorama, with the target's box where there is a target."""
+    """Return front view, this many pixels a side, and panorama, with the target's box where there is a target."""
     shown = observation.as_dict()
     return resize_view(shown["front"], side), shown["panorama"]
 
 
 def resize_view(view: Image, side: int | None) -> Image:
-    """Return a square view with so many pixels a side; as it is where none are given."""
+    """Return a square view with this many pixels a side; as it is where none are given."""
     if side is None or view.shape[:2] == (side, side):
         return view
     return np.asarray(cv2.resize(view, (side, side), interpolation=_choose_interpolation(view, side)), np.uint8)
@@ -70,7 +70,7 @@ def _draw_box(view: Image, box: Box | None) -> Image:
 
 
 def render_target(observation: Observation) -> Image | None:
-    """Return the view centred on the target, boxed; None where it is out of sight."""
+    """Return the view centred on the target, boxed; None if it is out of sight."""
     assert observation.target is not None
     views = cut_target_views(observation.panorama[None], observation.target.mask[None], (VIEW, VIEW))
     return views.images[0] if len(views.images) else None

@@ -48,11 +48,11 @@ class Glb:
         try:
             magic, version, length = struct.unpack_from("<4sII", data)
             if magic != b"glTF" or version != 2 or length > len(data):
-                raise ValueError("expected a GLB file of version 2, whole")
+                raise ValueError("expected a complete GLB file of version 2")
             chunks = dict(_chunks(data, length))
             document = parse_json(chunks[_JSON])
             if not isinstance(document, dict):
-                raise ValueError("its JSON is no object")
+                raise ValueError("its JSON is not an object")
         except UNREADABLE as error:
             raise FileError(f"{path}: cannot be read as GLB: {error} (damaged file?)") from error
         return Glb(path, document, chunks.get(_BIN, b""))
@@ -67,14 +67,14 @@ class Glb:
         return head + text + struct.pack("<II", len(body), _BIN) + body
 
     def items(self, name: str) -> list[Any]:
-        """Return a list of the document; empty where there is none."""
+        """Return a list of the document; empty if there is none."""
         return self.document.get(name, [])
 
     def view(self, index: int) -> memoryview:
         """Return the bytes of a buffer view."""
         view = self.items("bufferViews")[index]
         if view.get("buffer", 0) != 0:
-            raise ValueError(f"buffer view {index} lies in another file")
+            raise ValueError(f"buffer view {index} is in another file")
         start, length = int(view.get("byteOffset", 0)), int(view["byteLength"])
         if start < 0 or length < 0 or start + length > len(self.body):
             raise ValueError(f"buffer view {index} reaches beyond the file")
@@ -84,7 +84,7 @@ class Glb:
         """Return an accessor's values as they are stored, [N] or [N, components]."""
         accessor = self.items("accessors")[index]
         if "sparse" in accessor:
-            raise ValueError(f"accessor {index} is sparse, which is not read")
+            raise ValueError(f"accessor {index} is sparse, which is not supported")
         view = self.items("bufferViews")[accessor["bufferView"]]
         dtype, width = np.dtype(_DTYPES[accessor["componentType"]]), _WIDTHS[accessor["type"]]
         count, stride = int(accessor["count"]), int(view.get("byteStride", 0)) or width * dtype.itemsize
@@ -111,7 +111,7 @@ class Glb:
             index, above = stack.pop()
             seen += 1
             if seen > MOST_NODES:
-                raise ValueError("its nodes form a circle, or are too many")
+                raise ValueError("its nodes form a cycle, or are too many")
             node = nodes[index]
             here = above @ _local(node)
             if "mesh" in node:
@@ -121,14 +121,14 @@ class Glb:
     def _list_roots(self) -> list[int]:
         """Return the nodes that the file's scene begins with; without scenes, those that are nobody's children.
 
-        What a file without scenes shows is left open by glTF; here every part counts once.
+        glTF leaves open what a file without scenes shows; here every part counts once.
         """
         nodes, scenes = self.items("nodes"), self.items("scenes")
         if scenes:
             return list(scenes[self.document.get("scene", 0)].get("nodes", []))
         children = {child for node in nodes for child in node.get("children", [])}
         if nodes and len(children) >= len(nodes):
-            raise ValueError("its nodes form a circle")
+            raise ValueError("its nodes form a cycle")
         return [index for index in range(len(nodes)) if index not in children]
 
 

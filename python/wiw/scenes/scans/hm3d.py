@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
 """Habitat-Matterport 3D: `SCAN.basis.glb`, and for scans with labels `SCAN.semantic.glb` and `SCAN.semantic.txt`.
 
-Axis Z is up. The picture of the labels is painted on a mesh of its own: each colour is one object of the table. A line
-of the table is `id,RRGGBB,"category",region`; id 0 is unknown.
+Axis Z is up. The picture of the labels is painted on a separate mesh: each colour is one object of the table. A line of
+the table is `id,RRGGBB,"category",region`; id 0 is unknown.
 """
 
 from __future__ import annotations
@@ -83,7 +83,7 @@ def read_annotations(path: Path) -> Annotations:
         try:
             index, color, category, region = int(row[0]), int(row[1], 16), row[2].strip(), int(row[3])
             if index in table.objects or color in table.colors or not 0 <= color <= 0xFFFFFF:
-                raise ValueError("its id or colour is there already, or is none")
+                raise ValueError("its id or colour is invalid or already used")
         except (ValueError, IndexError) as error:
             raise FileError(
                 f'{path}: line {number}: expected id,RRGGBB,"category",region, got {",".join(row)!r:.80} ({error})'
@@ -109,11 +109,11 @@ def read(file: Path, options: dict[str, Any]) -> Imported:
             name=_name(file),
             flat=True,
             attributes={**about, "labels": "none"},
-            warnings=[*warnings, f"{painted.name} is not there: no object has a label"],
+            warnings=[*warnings, f"{painted.name} does not exist: no object has a label"],
         )
         return Imported(scene, read, [*absent, painted, listed])
-    table = read_annotations(require_file(listed, "expected the table of the labels beside their mesh"))
-    require_file(painted, "expected the mesh with the labels beside their table")
+    table = read_annotations(require_file(listed, "expected the table of the labels next to their mesh"))
+    require_file(painted, "expected the mesh with the labels next to their table")
     source, strange = read_painted(painted, table, up)
     pieces = transfer.transfer_labels(surface, source, file)
     instances = number_objects(table.objects, set(np.unique(pieces.labels).tolist()), listed)
@@ -219,7 +219,7 @@ def _placed_primitive(glb: Glb, primitive: dict[str, Any], transform: NDArray[np
     else:
         corners = np.arange(len(vertices), dtype=np.uint32).reshape(-1, 3)
     if (corners.size and corners.max() >= len(vertices)) or not np.isfinite(vertices).all():
-        raise ValueError("a triangle names a vertex that is not there, or one is not finite")
+        raise ValueError("a triangle refers to a vertex that does not exist or is not finite")
     uv = glb.values(attributes["TEXCOORD_0"]).astype(np.float32) if "TEXCOORD_0" in attributes else None
     colors = _vertex_colors(glb.values(attributes["COLOR_0"])) if "COLOR_0" in attributes else None
     picture = _picture(glb, primitive) if uv is not None else None
@@ -243,7 +243,7 @@ def _vertex_colors(values: NDArray[Any]) -> NDArray[np.uint8]:
 
 
 def _picture(glb: Glb, primitive: dict[str, Any]) -> NDArray[np.uint8] | None:
-    """Return the texture of a part, uint8 [H, W, 3]; None where it has none."""
+    """Return the texture of a part, uint8 [H, W, 3]; None if it has none."""
     if "material" not in primitive:
         return None
     material = glb.items("materials")[primitive["material"]]
@@ -253,5 +253,5 @@ def _picture(glb: Glb, primitive: dict[str, Any]) -> NDArray[np.uint8] | None:
     image = glb.items("images")[glb.items("textures")[info["index"]]["source"]]
     decoded = cv2.imdecode(np.frombuffer(glb.view(image["bufferView"]), np.uint8), cv2.IMREAD_COLOR)
     if decoded is None:
-        raise ValueError("a picture of the labels cannot be decoded")
+        raise ValueError("a label image cannot be decoded")
     return np.ascontiguousarray(decoded[..., ::-1])

@@ -99,7 +99,7 @@ def _count_parts(corners: NDArray[np.float32], path: object) -> NDArray[np.int64
 
 
 def _groups(counts: NDArray[np.int64]) -> Iterator[tuple[int, NDArray[np.int64]]]:
-    """Return triangles that are cut alike, some at a time."""
+    """Yield triangles that are cut in the same way, some at a time."""
     for count in np.unique(counts):
         members = np.flatnonzero(counts == count)
         size = max(1, _CHUNK // int(count) ** 2)

@@ -108,7 +108,7 @@ def read_house(path: Path) -> House:
                 read(words, categories, house)
             except (ValueError, IndexError, KeyError) as error:
                 raise FileError(
-                    f"{path}: line {number}: no record '{kind}' of a house ({type(error).__name__}: {error})"
+                    f"{path}: line {number}: not a house record '{kind}' ({type(error).__name__}: {error})"
                 ) from error
     _check_counts(path, records, house)
     return house
@@ -121,12 +121,12 @@ def _numbers(words: Sequence[str]) -> NDArray[np.float64]:
     return numbers
 
 
-def _plain(word: str) -> str:
+def _clean_word(word: str) -> str:
     return word.replace("#", " ").strip()
 
 
 def _add_category(words: list[str], categories: dict[int, Category], house: House) -> None:
-    categories[int(words[1])] = Category(_plain(words[3]), _plain(words[5]))
+    categories[int(words[1])] = Category(_clean_word(words[3]), _clean_word(words[5]))
 
 
 def _add_region(words: list[str], categories: dict[int, Category], house: House) -> None:
@@ -142,7 +142,7 @@ def _add_object(words: list[str], categories: dict[int, Category], house: House)
     if len(box) < 12:
         raise ValueError("expected a centre, two axes and half sizes, twelve numbers")
     if region >= 0 and region not in house.regions:
-        raise ValueError(f"its region {region} is not there")
+        raise ValueError(f"its region {region} does not exist")
     nothing = Category("", "")
     kind = nothing if category < 0 else categories[category]
     axes = np.stack([box[3:6], box[6:9], np.cross(box[3:6], box[6:9])])
@@ -162,7 +162,9 @@ def _check_counts(path: Path, records: dict[str, list[tuple[int, list[str]]]], h
 
 def is_scan(file: Path) -> bool:
     """Return whether a mesh file has Matterport3D's tables or labels beside it."""
-    return file.suffix.lower() in (".glb", ".obj") and (_house(file).is_file() or _semantic(file).is_file())
+    return file.suffix.lower() in (".glb", ".obj") and (
+        _find_house_file(file).is_file() or _find_semantic_file(file).is_file()
+    )
 
 
 def find(folder: Path, split: str) -> list[Path]:
@@ -174,11 +176,11 @@ def find(folder: Path, split: str) -> list[Path]:
     return require_scans(found, place, "Matterport3D's SCAN/SCAN.glb with SCAN.house and SCAN_semantic.ply beside it")
 
 
-def _house(file: Path) -> Path:
+def _find_house_file(file: Path) -> Path:
     return file.with_suffix(".house")
 
 
-def _semantic(file: Path) -> Path:
+def _find_semantic_file(file: Path) -> Path:
     return file.with_name(f"{file.stem}_semantic.ply")
 
 
@@ -186,12 +188,12 @@ def read(file: Path, options: dict[str, Any]) -> Imported:
     """Read a scan; without its `_semantic.ply` it has no instances of objects, and a warning."""
     up = options.get("up") or "z"
     scene, read, absent = import_scan(file, **import_options(options, up))
-    house_file = require_file(_house(file), "expected Matterport3D's table of objects beside the mesh")
+    house_file = require_file(_find_house_file(file), "expected Matterport3D's table of objects beside the mesh")
     house = read_house(house_file)
     rooms = name_rooms(house, up)
     about = {"up": f"{up.upper()} (Matterport3D)", "dataset": "Matterport3D"}
     listed = [dict(room) for room in rooms.values()]
-    semantic = _semantic(file)
+    semantic = _find_semantic_file(file)
     files = [*read, house_file]
     surface = transfer.Surface(*scene.world_triangles()[:2])
     if not semantic.is_file():
@@ -202,7 +204,7 @@ def read(file: Path, options: dict[str, Any]) -> Imported:
             rooms=listed,
             flat=True,
             attributes={**about, "labels": "none"},
-            warnings=[f"{semantic.name} is not there: no object has a label"],
+            warnings=[f"{semantic.name} does not exist: no object has a label"],
         )
         return Imported(scene, files, [*absent, semantic])
     vertices, triangles, object_ids, _ = _core.scene.read_ply_surface(
@@ -257,10 +259,10 @@ def _warnings(
     warnings = []
     if strange:
         warnings.append(
-            f"{semantic.name} labels {len(strange)} objects that the house file does not have: {_some(strange)}"
+            f"{semantic.name} labels {len(strange)} objects that the house file does not have: {_list_some(strange)}"
         )
     if lost:
-        warnings.append(f"{len(lost)} of {len(known)} objects have no surface: {_some(lost)}")
+        warnings.append(f"{len(lost)} of {len(known)} objects have no surface: {_list_some(lost)}")
     if unlabelled > 0.01:
         warnings.append(f"{100 * unlabelled:.0f} % of the surface is further than {transfer.REACH} m from any label")
     return warnings
@@ -276,15 +278,17 @@ def compare_boxes(file: Path, scene: _core.scene.Scene) -> list[str]:
     shown = [thing for thing in scene.instances if thing["triangle_count"] and "scan_id" in thing["attributes"]]
     things = {thing["attributes"]["scan_id"]: thing for thing in shown}
     far = []
-    for index, thing in read_house(_house(file)).objects.items():
+    for index, thing in read_house(_find_house_file(file)).objects.items():
         if str(index) in things:
             low, high = things[str(index)]["bounds"]
             distance = np.linalg.norm((low + high) / 2 - to_y_up(thing.centre, up))
             far.extend([index] * bool(distance > FAR))
     if not far:
         return []
-    return [f"{len(far)} of {len(things)} objects lie over {FAR} m from their boxes in the house file: {_some(far)}"]
+    return [
+        f"{len(far)} of {len(things)} objects are over {FAR} m from their boxes in the house file: {_list_some(far)}"
+    ]
 
 
-def _some(numbers: Sequence[int]) -> str:
+def _list_some(numbers: Sequence[int]) -> str:
     return ", ".join(map(str, numbers[:8])) + (", ..." if len(numbers) > 8 else "")

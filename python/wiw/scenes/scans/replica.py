@@ -51,7 +51,7 @@ def read_objects(path: Path) -> dict[int, ScanObject]:
     """Read the table of a room; where it has classes alone, each class is one object.
 
     Raises:
-        FileError: it is missing, no JSON, or an entry lacks what it needs or names a class that is not there.
+        FileError: it is missing or not JSON, or an entry is incomplete or names a class that does not exist.
     """
     text = read_text(require_file(path, "expected Replica's table of objects beside the mesh"))
     try:
@@ -61,7 +61,7 @@ def read_objects(path: Path) -> dict[int, ScanObject]:
             return {i: ScanObject(name, _plain(name)) for i, name in classes.items() if i >= 0}
         return dict(_object(item, classes) for item in body["objects"])
     except (LookupError, TypeError, ValueError, AttributeError, RecursionError) as error:
-        raise FileError(f"{path}: no table of Replica's ({type(error).__name__}: {error})") from error
+        raise FileError(f"{path}: not a Replica table ({type(error).__name__}: {error})") from error
 
 
 def _object(item: dict[str, Any], classes: dict[int, str]) -> tuple[int, ScanObject]:
@@ -83,7 +83,7 @@ def read(file: Path, options: dict[str, Any]) -> Imported:
         file, "object_id", limits=options.get("limits", {})
     )
     if colors is None:
-        raise FileError(f"{file}: has no colours (red, green, blue of each vertex), and nothing else to draw")
+        raise FileError(f"{file}: has no colours (red, green, blue of each vertex), so there is nothing to draw")
     if options.get("ceiling") is not None:
         raise ArgumentError(f"{file}: a ceiling cannot be added to a scan of Replica")
     mesh = {"positions": to_y_up(vertices, up), "triangles": triangles, "colors": colors, "material": 0}

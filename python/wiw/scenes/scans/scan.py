@@ -58,7 +58,7 @@ class InstanceTable:
         return len(self.instances)
 
     def number(self, labels: NDArray[np.int64]) -> NDArray[np.uint32]:
-        """Return instance ids uint32 of the dataset's ids, of any shape; unlabelled where there is no such object."""
+        """Return instance ids uint32 of the dataset's ids, of any shape; unlabelled if that object does not exist."""
         table = np.full(max(self.ids, default=0) + 2, self.unlabelled_id, np.uint32)
         for source, instance in self.ids.items():
             table[source] = instance
@@ -109,7 +109,7 @@ def rotation_of(quaternion: Iterable[float]) -> NDArray[np.float64]:
     w, x, y, z = np.array(list(quaternion), float)
     length = np.sqrt(w * w + x * x + y * y + z * z)
     if not length > 0 or not np.isfinite(length):
-        raise ValueError("a rotation is no quaternion")
+        raise ValueError("a rotation is not a quaternion")
     w, x, y, z = w / length, x / length, y / length, z / length
     return np.array(
         [

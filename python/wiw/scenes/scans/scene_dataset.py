@@ -83,7 +83,7 @@ class Dataset:
         return Dataset(path, read_object(path), [path])
 
     def section(self, name: str) -> Mapping[str, Any]:
-        """Return a section, empty where there is none."""
+        """Return a section, empty if there is none."""
         found = self.body.get(name, {})
         return found if isinstance(found, Mapping) else {}
 
@@ -137,13 +137,13 @@ class Dataset:
             try:
                 names |= {int(entry["id"]): str(entry["name"]) for entry in read_object(file).get("classes", [])}
             except _UNREADABLE as error:
-                raise FileError(f"{file}: no lexicon of classes ({type(error).__name__}: {error})") from error
+                raise FileError(f"{file}: not a lexicon of classes ({type(error).__name__}: {error})") from error
             self.read.append(file)
         return names
 
     @cached_property
     def listed_names(self) -> dict[str, str]:
-        """Categories by template, from HSSD's `semantics/objects.csv`; empty where there is no such table."""
+        """Categories by template, from HSSD's `semantics/objects.csv`; empty if there is no such table."""
         file = self.path.parent / "semantics" / "objects.csv"
         if not file.is_file():
             return {}
@@ -303,7 +303,7 @@ def read(file: Path, options: dict[str, Any]) -> Imported:
     """Read a scene.
 
     Raises:
-        FileError: it or its dataset is damaged, or files and templates that it names are not there; names all of them.
+        FileError: it or its dataset is damaged, or files and templates that it names do not exist; names all of them.
     """
     dataset, body = find_dataset(file), read_object(file)
     assembly = _Assembly(dataset, options)
@@ -321,7 +321,7 @@ def read(file: Path, options: dict[str, Any]) -> Imported:
     if assembly.missing:
         lost = list(dict.fromkeys(assembly.missing))
         listed = "\n  ".join(lost[:100]) + ("\n  ..." if len(lost) > 100 else "")
-        raise FileError(f"{file}: {len(lost)} things that it names are not in {dataset.path.parent}:\n  {listed}")
+        raise FileError(f"{file}: {len(lost)} objects that it names are not in {dataset.path.parent}:\n  {listed}")
     nameless = sum(not instance["category"] for instance in assembly.instances[1:])
     if nameless:
         assembly.warnings.append(f"{nameless} of {len(assembly.instances) - 1} objects have no category")

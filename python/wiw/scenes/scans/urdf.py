@@ -33,7 +33,7 @@ def read_visuals(path: Path, pose: Mapping[str, float] | Sequence[float] = ()) -
         pose: joint values in radians and metres, by name or in the order of the movable joints; 0 for the others.
 
     Raises:
-        FileError: it is missing, no URDF, or its joints are no tree.
+        FileError: it is missing, no URDF, or its joints do not form a tree.
     """
     try:
         if path.stat().st_size > MOST_BYTES:
@@ -44,7 +44,7 @@ def read_visuals(path: Path, pose: Mapping[str, float] | Sequence[float] = ()) -
     except OSError as error:
         raise FileError(f"{path}: {error.strerror or error}") from error
     except (ET.ParseError, LookupError, ValueError, AttributeError, TypeError) as error:
-        raise FileError(f"{path}: no URDF that can be read ({type(error).__name__}: {error})") from error
+        raise FileError(f"{path}: not a readable URDF ({type(error).__name__}: {error})") from error
 
 
 def _numbers(text: str | None, count: int, default: float = 0.0) -> NDArray[np.float64]:
@@ -101,7 +101,7 @@ def _place_links(robot: ET.Element, pose: Mapping[str, float] | Sequence[float])
         while name in above:
             chain.append(above[name])
             if len(chain) > len(joints):
-                raise ValueError("its joints form a circle")
+                raise ValueError("its joints form a cycle")
             name = above[name].find("parent").attrib["link"]  # type: ignore[union-attr]
         transform = np.eye(4)
         for joint in reversed(chain):

@@ -27,7 +27,7 @@ class PlaceBatch:
     views: Tensor
     """[B, F, 3, H, W]."""
     log_distances: Tensor | None
-    """[B, F, 1, H, W] of the views; None where the dataset has no depth."""
+    """[B, F, 1, H, W] of the views; None if the dataset has no depth."""
 
 
 def draw_batch(

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Windows of held-out scenes, rendered as they are asked for: what world models are measured on.
+"""Windows of held-out scenes, rendered as they are requested: what world models are measured on.
 
 `wiw collect navigation` refuses scenes of val and test splits, so that nobody trains on them. These windows are drawn
 by the same traversals, and are never written.
@@ -106,13 +106,13 @@ def measure(
     """Yield the PSNR in dB of each model's frames, weighted by latitude, in full size and reduced to size `small`.
 
     The control gap is measured on mixed windows, with the places of each replaced by those of another, turns kept: rows
-    whose "control" is "shuffled". Turns are rolls, which show nothing of what a model has learnt.
+    whose "control" is "shuffled". Turns are rolls, which say nothing about what a model has learnt.
 
     Raises:
         ArgumentError: there are no windows.
     """
     if not windows:
-        raise ArgumentError("expected scenes in which windows can be drawn, got none; name others")
+        raise ArgumentError("expected scenes from which windows can be sampled, got none; choose others")
     others = shuffle_places(windows, seed)
     for index, window in enumerate(windows):
         trajectories = {"true": window.trajectory}
@@ -151,7 +151,9 @@ def evaluate(
     """
     names = scenes.resolve(specs)
     windows = [
-        window for name in bar(names, f"measuring on {specs}", len(names)) for window in draw_windows(name, count, seed)
+        window
+        for name in bar(names, f"evaluating on {specs}", len(names))
+        for window in draw_windows(name, count, seed)
     ]
     rows = list(measure(windows, {**BASELINES, "pocket": imagine_by(model)}, seed))
     return {

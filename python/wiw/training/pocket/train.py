@@ -68,11 +68,11 @@ def train_pocket(
         part: of the dataset: "train", which leaves a share of the scenes for validation, or "all".
         validation: folder of another dataset whose clips it is validated on; the scenes left out if None.
         decisions: file of `wiw collect decisions`, for the rank agreement with the oracle.
-        tracker: "trackio", "wandb" or "tensorboard", told what the log is.
+        tracker: "trackio", "wandb" or "tensorboard", which receives the log.
         seconds: least time between two writes of the state.
         on_step: called after each step with its number, the number of all steps and a running mean of the loss.
         on_validation: called after each validation with the number of steps done and what was found.
-        bar: shows how far decoding has come.
+        bar: shows the progress of decoding.
 
     Returns:
         The card in the file: data, recipe, steps, validation and the loss at the end.

@@ -160,7 +160,7 @@ class ClipTrainer(ResumableTrainer, ABC):
 
     @contextmanager
     def use_averages(self) -> Iterator[None]:
-        """Exchange the weights for their averages, where there are any, as long as the context lasts."""
+        """Exchange the weights for their averages, if there are any, as long as the context lasts."""
         self._exchange_averages()
         try:
             yield
@@ -202,7 +202,7 @@ class ClipTrainer(ResumableTrainer, ABC):
         names = [self.clips.describe(int(row)) for row in rows]
         raise TrainingError(
             f"step {self.step_count + 1}: the {what} is not finite on a batch of {'; '.join(names)}. The state before "
-            "this step is kept. Look at these clips (`wiw data verify`), or begin anew with a lower rate or "
+            "this step is kept. Check these clips (`wiw data verify`), or start again with a lower rate or "
             "precision=float32"
         )
 
@@ -236,9 +236,9 @@ def require_equal_shares(batch: int, rows: int, processes: int) -> None:
     passes = batch // rows
     if passes % processes:
         raise ArgumentError(
-            f"a step of {batch} clips has {passes} passes of {rows}, which {processes} processes cannot share out "
-            "evenly; expected a number of processes that divides the passes: change --gpus or --nodes, or batch or "
-            "rows of the recipe"
+            f"a step of {batch} clips has {passes} passes of {rows}, which cannot be split evenly among {processes} "
+            "processes; expected a number of processes that divides the passes: change --gpus or --nodes, or the "
+            "recipe's batch or rows"
         )
 
 

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Clips as tensors: resized, mirrored where that is asked for, several together."""
+"""Clips as tensors: resized, mirrored where that is requested, several together."""
 
 from __future__ import annotations
 

@@ -202,14 +202,16 @@ def add_lora(pipeline: Any, place: str, rank: int, layers: Sequence[str] = LORA_
     from peft import LoraConfig
 
     if not supports_lora(pipeline):
-        raise ArgumentError(f"lora: {type(pipeline).__name__} takes no LoRA; train the whole denoiser with lora=0")
+        raise ArgumentError(
+            f"lora: {type(pipeline).__name__} does not support LoRA; train the whole denoiser with lora=0"
+        )
     denoiser = getattr(pipeline, place)
     names = [name for name, _ in denoiser.named_modules()]
     empty = [layer for layer in layers if not any(name.endswith(f".{layer}") for name in names)]
     if empty:
         raise ArgumentError(
-            f"lora: {type(denoiser).__name__} has no layers {', '.join(empty)}, so that a LoRA of them would cover "
-            "nothing; train the whole denoiser with lora=0"
+            f"lora: {type(denoiser).__name__} has no layers {', '.join(empty)}, so a LoRA would have no effect; train "
+            "the whole denoiser with lora=0"
         )
     denoiser.requires_grad_(False)
     denoiser.add_adapter(LoraConfig(r=rank, lora_alpha=rank, target_modules=list(layers)), adapter_name=ADAPTER)

@@ -45,7 +45,7 @@ class Clip:
 
 
 class CorpusClips(Sequence[Clip], ABC):
-    """Clips of one length; each is read when it is asked for."""
+    """Clips of one length; each is read when it is requested."""
 
     @abstractmethod
     def describe(self, index: int) -> str:
@@ -74,7 +74,7 @@ class Corpus(ABC):
 
     @abstractmethod
     def clips(self, frames: int) -> CorpusClips:
-        """Return all clips of so many frames.
+        """Return all clips with this number of frames.
 
         Raises:
             ArgumentError: there is none.
@@ -166,7 +166,7 @@ class NavigationCorpus(Corpus):
         return cut_front_views(images, self._crop) if self._crop else images
 
     def clips(self, frames: int) -> CorpusClips:
-        """Return all windows of so many frames; see `Corpus.clips`."""
+        """Return all windows with this number of frames; see `Corpus.clips`."""
         return NavigationClips(self.data.clips(frames), self.cut_views)
 
     def select_clips(self, frames: int, count: int, seed: int, size: tuple[int, int]) -> HeldOutClips[Any]:

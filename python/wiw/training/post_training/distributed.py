@@ -49,7 +49,7 @@ def require_own_gpu(device: str) -> None:
     if count_processes() == 1 or not device.startswith("cuda"):
         return
     if device != "cuda":
-        raise ArgumentError(f"device: expected cuda, of which each process takes its own, got {device}")
+        raise ArgumentError(f"device: expected cuda, as each process takes its own GPU, got {device}")
     if _find_local_rank() >= torch.cuda.device_count():
         raise ArgumentError(f"expected a GPU for each process, got {torch.cuda.device_count()} GPUs here; lower --gpus")
 

@@ -43,7 +43,7 @@ def encode_clips(
     progress: Progress = lambda *_: None,
     **weights: Any,
 ) -> int:
-    """Encode all clips that `post_train` with the same arguments will ask for; those in the cache stay as they are.
+    """Encode all clips that `post_train` with the same arguments will use; those in the cache stay as they are.
 
     Args:
         name: such as "ltx-action".
@@ -114,7 +114,7 @@ class ClipEncoder:
 
 
 def _list_rows(name: str, data: str | Path, recipe: PostTrainingRecipe, part: CorpusPart) -> Iterator[dict[str, Any]]:
-    """Yield the clips that a training asks for, mirrored ones too where it mirrors some."""
+    """Yield the clips that a training uses, including mirrored ones where it mirrors some."""
     corpus, fitted = find_family(name).fit(open_corpus(data, part, recipe.held_out), recipe)
     order = replace(arrange_clips(len(corpus.clips(fitted.frames)), fitted), batch=1)
     sides = [side for side, share in ((False, 1 - fitted.mirror), (True, fitted.mirror)) if share > 0]

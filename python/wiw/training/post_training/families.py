@@ -107,7 +107,9 @@ class VideoFamily(Family):
         if corpus.space != GRIPPER_POSES:
             require_panoramas(self.world_model, corpus)
         if corpus.space == GRIPPER_POSES and recipe.mirror:
-            raise ArgumentError("recipe: mirror: the mirror image of an arm is another arm; expected 0 for poses")
+            raise ArgumentError(
+                "recipe: mirror: the mirror image of a robot arm is a different arm; expected 0 for poses"
+            )
         return corpus, replace(recipe, size=recipe.size or self._find_size(corpus))
 
     def list_options(self, corpus: Corpus, recipe: PostTrainingRecipe) -> dict[str, Any]:
@@ -132,7 +134,7 @@ class VideoFamily(Family):
 
 
 class NWMFamily(Family):
-    """Navigation World Models, which follows motions between front views by itself."""
+    """Navigation World Models, which is conditioned on motions between front views already."""
 
     world_model = "nwm"
     checkpoint_option = "weights"
@@ -141,8 +143,8 @@ class NWMFamily(Family):
         """Return front views; they are cut out of panoramas as the loop does."""
         if not isinstance(corpus, NavigationCorpus):
             raise ArgumentError(
-                "nwm-action follows an agent that moves, but in this dataset a gripper does; expected a dataset of "
-                "`wiw collect navigation`, or a video model (NAME-action)"
+                "nwm-action follows a moving agent, but this dataset is of a gripper; expected a dataset of `wiw "
+                "collect navigation`, or a video model (NAME-action)"
             )
         size = recipe.size or NWM.accepts.size
         return corpus.show_front(size), replace(recipe, size=size)

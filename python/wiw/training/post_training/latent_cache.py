@@ -58,7 +58,7 @@ class LatentCache:
 
 
 def _read(path: Path) -> dict[str, Tensor] | None:
-    """Return a file's tensors; None where it is missing or damaged, and has to be made anew."""
+    """Return a file's tensors; None if it is missing or damaged, and has to be made anew."""
     try:
         return load(path.read_bytes())
     except (FileNotFoundError, SafetensorError):

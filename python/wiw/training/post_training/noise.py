@@ -52,8 +52,8 @@ def weigh_by_bell(levels: Tensor, shift: float) -> Tensor:
     The weights of DiffSynth-Studio's recipes for Wan: levels in the middle count most, the ends nothing.
     """
     schedule = shift_level((torch.arange(1000) + 0.5) / 1000, shift)
-    return _bell(levels) / _bell(schedule).mean().to(levels.device)
+    return _compute_bell(levels) / _compute_bell(schedule).mean().to(levels.device)
 
 
-def _bell(levels: Tensor) -> Tensor:
+def _compute_bell(levels: Tensor) -> Tensor:
     return torch.exp(-2 * (levels - 0.5) ** 2) - math.exp(-0.5)

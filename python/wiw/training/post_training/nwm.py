@@ -131,7 +131,7 @@ class TrainableNWM(TrainableModel):
 
         Frames are the part of the front view that the network sees, which is also all that it imagines.
         """
-        assert isinstance(held_out, NavigationCorpus), "the family trains on no other"
+        assert isinstance(held_out, NavigationCorpus), "the only value for this family"
         context, size = self.network.size.context, self.recipe.clip_size
         longest = max((row["frames"] for row in held_out.data.segments), default=0)
         clips = held_out.data.clips(max(context + 1, min(context + max(STEPS), longest)))

@@ -25,7 +25,7 @@ def create_optimizer(parameters: Sequence[nn.Parameter], recipe: ClipRecipe) -> 
         return torch.optim.AdamW(parameters, **options)
     if importlib.util.find_spec("bitsandbytes") is None:
         raise DependencyError(
-            "bitsandbytes not installed, which optimizer=adamw8bit needs; pip install 'wiw[lowbit]', or use "
+            "optimizer=adamw8bit needs bitsandbytes, which is not installed; pip install 'wiw[lowbit]', or use "
             "optimizer=adamw"
         )
     from bitsandbytes.optim import AdamW8bit

@@ -35,7 +35,7 @@ class ClipRecipe(ABC):
     rate: float
     """Peak learning rate."""
     clips: int | None = 40_000
-    """How many clips are trained on; all there are if None. Fewer clips are always among the more."""
+    """Number of clips in training; all there are if None. Fewer clips are always among the more."""
     epochs: int = 1
     batch: int = 16
     """Clips per step of the optimiser."""

@@ -26,7 +26,7 @@ def create_sampler(trainer: PostTrainer) -> TrainingSampler:
 class TrainingSampler:
     """Imagine frames with networks in training; see `wiw.training.held_out_clips.Imagine`.
 
-    Training goes on as if nothing had been imagined: weights, modes, random states and where networks lie are as
+    Training continues as if nothing had been imagined: weights, modes, random states and where networks lie are as
     before.
 
     Args:

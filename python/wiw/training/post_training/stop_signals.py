@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""A checkpoint that is also written when a process is told to stop: batch systems send SIGTERM or SIGUSR1."""
+"""A checkpoint that is also written on a signal to stop: batch systems send SIGTERM or SIGUSR1."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from wiw.training.checkpoint import Checkpoint, ResumableTrainer, TrainingState
 from wiw.training.post_training import distributed
 
 STOPPING = (signal.SIGTERM, signal.SIGINT)
-"""Signals after which the training stops, once its state is written; after SIGUSR1 it goes on."""
+"""Signals after which the training stops, once its state is written; after SIGUSR1 it continues."""
 
 
 class SignalledCheckpoint(Checkpoint):
@@ -31,7 +31,7 @@ class SignalledCheckpoint(Checkpoint):
     _pending = 0
 
     def load(self) -> TrainingState | None:
-        """Read the file; None where there is none.
+        """Read the file; None if there is none.
 
         Raises:
             ArgumentError: it belongs to another training, or only some processes find it.
@@ -39,7 +39,7 @@ class SignalledCheckpoint(Checkpoint):
         """
         if len(set(distributed.collect(self.path.exists()))) > 1:
             raise ArgumentError(
-                f"{self.path} is there on some machines only: expected a folder that all share; name one by --out"
+                f"{self.path} exists on some machines only: expected a folder that all share; choose one with --out"
             )
         return super().load()
 
@@ -61,7 +61,7 @@ class SignalledCheckpoint(Checkpoint):
                 signal.signal(number, handler)
 
     def save_if_due(self, trainer: ResumableTrainer, epochs: int, step: int) -> None:
-        """Write the file if a signal has come or the last write was long enough ago; then stop, if so told.
+        """Write the file if a signal has come or the last write was long enough ago; then stop, if the signal says so.
 
         Raises:
             FileError: it cannot be written.

@@ -79,7 +79,7 @@ class SVDObjective(Objective):
         return (predicted.float() - wanted).square().mean(dim=(1, 2, 3, 4))
 
     def _identify(self, noise: Tensor) -> Tensor:
-        """Return what the pipeline says of a clip, [B, 3]: frames a second, motion, noise on the observation."""
+        """Return what the pipeline says of a clip, [B, 3]: frames per second, motion, noise on the observation."""
         return torch.stack([torch.full_like(noise, self._ids[0]), torch.full_like(noise, self._ids[1]), noise], dim=1)
 
     def _blank(self, sampled: Sampled, random: torch.Generator) -> tuple[Tensor, Tensor]:

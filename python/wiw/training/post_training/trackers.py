@@ -14,7 +14,7 @@ TRACKERS = ("trackio", "wandb", "tensorboard")
 
 
 class Tracker(Protocol):
-    """Something that is told numbers by step; `accelerate.tracking.GeneralTracker` is one."""
+    """An object that receives numbers by step; `accelerate.tracking.GeneralTracker` is one."""
 
     def log(self, values: dict[str, Any], step: int | None = None) -> None:
         """Take numbers by name."""
@@ -29,11 +29,11 @@ def open_tracker(name: str, run: str, folder: Path, config: Mapping[str, Any]) -
     Args:
         name: one of `TRACKERS`.
         run: name of the training: the tracker's project.
-        folder: where tensorboard writes; the others have places of their own.
+        folder: where tensorboard writes; the others have their own places.
         config: numbers and texts that the training is made with.
 
     Raises:
-        ArgumentError: there is no such tracker.
+        ArgumentError: the name is unknown.
         DependencyError: it, or accelerate, is not installed.
     """
     if name not in TRACKERS:

@@ -81,13 +81,13 @@ def post_train(
         weights: pretrained, a folder as the world model takes it or a name on the hub; its usual ones if None.
         revision: of the weights on the hub.
         variant: of the weight files, such as "fp16".
-        device: of torch; "cuda" where there is one, else "cpu".
-        recipe: the numbers; the shipped recipe if None, in float32 where there is no GPU.
+        device: of torch; "cuda" if there is one, else "cpu".
+        recipe: the numbers; the shipped recipe if None, in float32 if there is no GPU.
         part: of the data: "train", which leaves a share of scenes or demonstrations for validation, or "all".
         validation: folder of another dataset whose clips it is validated on; what is left out if None. With all of the
             data in training and no other dataset, there is no validation, and the checkpoint has the last weights.
         decisions: file of `wiw collect decisions`, for the rank agreement with the oracle.
-        tracker: "trackio", "wandb" or "tensorboard", told what the log is.
+        tracker: "trackio", "wandb" or "tensorboard", which receives the log.
         cache: folder where encoded clips are kept, for later epochs and other trainings on the same data; none if None.
         seconds: least time between two writes of the state.
         on_step: called after each step with its number, the number of all steps and a running mean of the loss.
@@ -167,11 +167,11 @@ def train_and_validate(
     Args:
         trainer: to be trained.
         imagine: with its networks; None without validation.
-        validation: what it is measured on; None to log alone.
+        validation: the validation set; None to log alone.
         out: of the training; its log is in `OUT.log`, and begins anew where no state is kept.
         save: writes the trainer's weights as a checkpoint, given the folder and what was found.
         state: of the training; written every so often and at signals.
-        tracker: "trackio", "wandb" or "tensorboard", told what the log is.
+        tracker: "trackio", "wandb" or "tensorboard", which receives the log.
         on_step: called after each step with its number, the number of all steps and a running mean of the loss.
         on_validation: called after each validation with the number of steps done and what was found.
 
@@ -225,7 +225,7 @@ def _run_steps(
 
 
 def _open_log(out: Path, tracker: str | None, recipe: ClipRecipe) -> TrainingLog:
-    """Return the log of a training, which a tracker is told as well."""
+    """Return the log of a training, which is also passed to a tracker."""
     folder, told = locate_log(out), tracker if distributed.is_main() else None
     return TrainingLog(folder / LOG, [open_tracker(told, out.name, folder, recipe.describe())] if told else [])
 
@@ -294,7 +294,7 @@ def describe_training(loaded: Loaded, corpus: Corpus) -> dict[str, Any]:
 def write_checkpoint(
     out: Path, trainer: PostTrainer, card: Mapping[str, Any], replace: Callable[[Path], bool] = lambda _: False
 ) -> None:
-    """Write what world models load, and how it was made, as a folder that is there whole or not at all.
+    """Write what world models load, and how it was made, as a folder that exists whole or not at all.
 
     `replace` says whether a folder that holds something may be replaced.
 
@@ -319,7 +319,7 @@ def open_cache(folder: Path, loaded: Loaded, corpus: Corpus) -> LatentCache:
 
 
 def choose_precision(recipe: PostTrainingRecipe, device: str | None) -> PostTrainingRecipe:
-    """Return the recipe in float32 where there is no GPU, on which half precision is fast."""
+    """Return the recipe in float32 if there is no GPU, on which half precision is fast."""
     return recipe if devices.device(device).startswith("cuda") else replace(recipe, precision="float32")
 
 
@@ -340,4 +340,4 @@ def list_remedies(recipe: PostTrainingRecipe) -> list[str]:
 
 def _require_free(out: Path) -> None:
     if out.exists() and (not out.is_dir() or any(out.iterdir())):
-        raise ArgumentError(f"{out} holds something already; name a folder that is new or empty")
+        raise ArgumentError(f"{out} is not empty; choose a new or empty folder")

@@ -107,7 +107,7 @@ class PostTrainer(ClipTrainer):
         return self.model.compute_losses(place, encoded, actions, random)
 
     def _encode_clips(self, rows: NDArray[np.int64], mirrored: Sequence[bool]) -> tuple[Encoded, Tensor]:
-        """Return clips as the networks see them, each encoded by itself, and their actions."""
+        """Return clips as the networks see them, each encoded separately, and their actions."""
         found = [self._encode_clip(int(row), mirror) for row, mirror in zip(rows, mirrored, strict=True)]
         encoded = {name: torch.cat([each[name] for each, _ in found]) for name in found[0][0]}
         return encoded, torch.cat([actions for _, actions in found])

@@ -15,11 +15,11 @@ from wiw.training.post_training.trackers import Tracker
 
 
 class TrainingLog:
-    """A file of JSON lines, and whatever trackers are told the same.
+    """A file of JSON lines, and trackers that receive the same values.
 
     Args:
         path: of the file.
-        trackers: told every line's numbers.
+        trackers: receives every line's numbers.
     """
 
     def __init__(self, path: Path, trackers: Sequence[Tracker] = ()) -> None:
@@ -49,7 +49,7 @@ class TrainingLog:
             whole, newline, _ = self.path.read_text(encoding="utf-8").rpartition("\n")
             return [json.loads(line) for line in whole.splitlines()] if newline else []
         except (OSError, ValueError) as error:
-            raise FileError(f"{self.path}: expected a JSON object a line, got {error}; delete it") from error
+            raise FileError(f"{self.path}: expected one JSON object per line, got {error}; delete it") from error
 
     def write(self, step: int, values: Mapping[str, float]) -> None:
         """Add a line of numbers.

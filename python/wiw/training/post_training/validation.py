@@ -76,7 +76,7 @@ def find_held_out(
 ) -> Corpus | None:
     """Return what a training is validated on: another dataset, or the part that its own leaves out for it.
 
-    None where there is no validation.
+    None if there is no validation.
 
     Args:
         open_part: opens either.
@@ -94,11 +94,11 @@ def find_held_out(
     held_out = open_part(corpus.data.folder, "held-out") if validation is None else open_part(validation, "all")
     if held_out.space != corpus.space:
         raise ArgumentError(
-            f"validation: expected a dataset of `{corpus.command}`, as that of the training is, but "
-            f"{held_out.data.folder} is of `{held_out.command}`"
+            f"validation: expected a dataset of `{corpus.command}`, like the training's, but {held_out.data.folder} is "
+            f"from `{held_out.command}`"
         )
     if decisions is not None and corpus.space != PRIMITIVES:
-        raise ArgumentError("decisions: those of `wiw collect decisions` are an agent's that moves; leave them out")
+        raise ArgumentError("decisions: those of `wiw collect decisions` are for a moving agent; leave them out")
     names, trained = held_out.units, corpus.units
     if names & trained:
         raise ArgumentError(
@@ -107,7 +107,7 @@ def find_held_out(
     if not names:
         raise ArgumentError(
             f"validation: no {corpus.unit} of {held_out.data.folder} is held out; collect more {corpus.unit}s, raise "
-            "held_out in the recipe, give another dataset by --validation, or train without (--option "
+            "held_out in the recipe, give another dataset with --validation, or train without validation (--option "
             "validate_every=null)"
         )
     return held_out
@@ -136,7 +136,7 @@ def build_validation_set(
         longest, actions = stored[0].plans.shape[-1], clips.plans.shape[1]
         if longest > actions:
             raise ArgumentError(
-                f"{decisions}: expected plans of at most {actions} actions, those of a clip, got {longest}; collect "
+                f"{decisions}: expected plans of at most {actions} actions, as in a clip, got {longest}; collect "
                 f"others with --actions {actions}"
             )
         identity["decisions"] = digest_decisions(decisions)
@@ -145,7 +145,7 @@ def build_validation_set(
 
 
 class ValidatedTrainer(ResumableTrainer):
-    """A trainer that is validated before a step, every so many steps; what it learns does not depend on it.
+    """A trainer that is validated before a step, every so many steps; training does not depend on it.
 
     Validation belongs to the step after it, so that a state written before it resumes with it. The weights, the log
     and the picture of the best are in one folder. With several processes, all imagine the same, with weights that may
@@ -154,12 +154,12 @@ class ValidatedTrainer(ResumableTrainer):
     Args:
         trainer: to be validated.
         imagine: with its networks.
-        validation: what it is measured on; None to log alone.
+        validation: the validation set; None to log alone.
         log: of the training; pictures and the best weights lie beside it.
         save: writes the trainer's weights as a checkpoint, given the folder and what was found; called in all
             processes.
-        between: called between two calls of the model, such as to stop when told to.
-        on_validation: told what was found, in the first process.
+        between: called between two calls of the model, for example to stop on a signal.
+        on_validation: receives the results, in the first process.
     """
 
     def __init__(

@@ -29,7 +29,7 @@ HUB = "facebook/nwm"
 
 @dataclass(kw_only=True, eq=False)
 class NWM(WorldModel):
-    """Navigation World Models: frame after frame, each from the last four and the motion to it (Bar et al. 2025).
+    """Navigation World Models: frame by frame, each from the last four and the motion to it (Bar et al. 2025).
 
     It sees the middle of the front view in 4:3; the rest of its frames is black. The first context is taken from
     `observations.history` at the spacing of its own frames (`context.py`); without one it is the observation repeated.
@@ -40,9 +40,9 @@ class NWM(WorldModel):
         file: name of the checkpoint in the folder or repository.
         revision: branch, tag or commit of the repository.
         vae: folder or hub repository of the image codec (`AutoencoderKL`); by default the folder `vae` beside
-            the checkpoint, where there is one, else stabilityai/sd-vae-ft-ema.
+            the checkpoint, if there is one, else stabilityai/sd-vae-ft-ema.
         vae_revision: branch, tag or commit of that.
-        device: of torch; "cuda" where there is one, else "cpu".
+        device: of torch; "cuda" if there is one, else "cpu".
         precision: of the computation; bfloat16 on a GPU, float32 on the CPU. Weights stay float32.
         steps: of diffusion, for each frame.
         spacing: metres between waypoints of the training data that is likest to the agent's world: 0.25 recon, 0.38
@@ -91,7 +91,7 @@ class NWM(WorldModel):
         import torch
 
         self._place = torch.device(self.device)
-        with devices.memory_guard("NWM", "its weights take about 4.5 GB; free the GPU of other programs"):
+        with devices.memory_guard("NWM", "its weights take about 4.5 GB; stop other programs that use the GPU"):
             self._network, self._codec = self._load_networks()
         self.accepts = replace(self.accepts, history=self._network.size.context)
         self._side = self._network.size.latent_side * 2 ** (len(self._codec.config.block_out_channels) - 1)
@@ -145,7 +145,7 @@ class NWM(WorldModel):
             return self._roll_out(observations, motion, np.array([c.length for c in controls]), seeds)
 
     def _use_precision(self) -> Any:
-        """Compute products in the lower precision, where there is one."""
+        """Compute products in the lower precision, if there is one."""
         import torch
 
         dtype = getattr(torch, str(self.precision))

@@ -44,7 +44,7 @@ def motions(trajectory: NDArray[np.float64], spacing: float, rollout_convention:
 
 
 def _steps(poses: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Return each pose seen from the one before."""
+    """Return each pose relative to the one before."""
     change, azimuth = np.diff(poses, axis=0), poses[:-1, 2]
     cos, sin = np.cos(azimuth), np.sin(azimuth)
     forward = cos * change[:, 0] + sin * change[:, 1]

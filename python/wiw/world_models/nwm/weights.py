@@ -63,20 +63,20 @@ def load_cdit(path: Path) -> CDiT:
         size = Architecture.of(state)
     except KeyError as error:
         raise WeightsError(
-            f"{path}: no weights of a CDiT: there is no {error}; it holds {_some(sorted(state))}", "unfit"
+            f"{path}: not weights of a CDiT: expected {error}; it has {_list_some(sorted(state))}", "unfit"
         ) from None
     with torch.device("meta"):
         network = CDiT(size)
     expected = {name: tuple(value.shape) for name, value in network.state_dict().items()}
     found = {name: tuple(value.shape) for name, value in state.items()}
     if expected != found:
-        raise WeightsError(f"{path}: no weights of a CDiT of {size}: {_difference(expected, found)}", "unfit")
+        raise WeightsError(f"{path}: not weights of a CDiT of size {size}: {_difference(expected, found)}", "unfit")
     network.load_state_dict(state, assign=True)
     return network.float().eval().requires_grad_(False)
 
 
 def save(folder: Path, network: CDiT, codec: Any) -> None:
-    """Write a network and its codec into a folder, which is then a checkpoint of its own."""
+    """Write a network and its codec into a folder, which is then a complete checkpoint."""
     state = {name: value.detach().contiguous().cpu() for name, value in network.state_dict().items()}
     save_file(state, folder / TRAINED)
     codec.save_pretrained(folder / "vae")
@@ -86,7 +86,7 @@ def load_codec(vae: str, revision: str | None) -> Any:
     """Load the image codec from a local folder or the hub.
 
     Raises:
-        WeightsError: nothing there, or not a whole AutoencoderKL.
+        WeightsError: the folder is empty, or the AutoencoderKL is incomplete.
     """
     try:
         codec: Any = AutoencoderKL.from_pretrained(vae, revision=revision)
@@ -97,7 +97,7 @@ def load_codec(vae: str, revision: str | None) -> Any:
             f"no AutoencoderKL in {vae} ({_first_line(error)}); `hf download {CODEC} --local-dir FOLDER` fetches one"
         ) from error
     if lacking := [name for name, value in codec.named_parameters() if value.is_meta]:
-        raise WeightsError(f"{vae} lacks {len(lacking)} parameters: {_some(lacking)}; fetch it again", "unfit")
+        raise WeightsError(f"{vae} lacks {len(lacking)} parameters: {_list_some(lacking)}; fetch it again", "unfit")
     return codec.float().eval().requires_grad_(False)
 
 
@@ -127,12 +127,12 @@ def _state(path: Path) -> dict[str, Tensor]:
     except (pickle.UnpicklingError, RuntimeError, EOFError) as error:
         raise WeightsError(
             f"{path}: not a checkpoint that can be read without running code from it ({_first_line(error)}); save its "
-            "'ema' with safetensors.torch.save_file and name that file",
+            "'ema' with safetensors.torch.save_file and use that file",
             "unfit",
         ) from error
     if not isinstance(checkpoint, dict) or not isinstance(checkpoint.get("ema"), dict):
         keys = sorted(map(str, checkpoint)) if isinstance(checkpoint, dict) else [type(checkpoint).__name__]
-        raise WeightsError(f"{path}: expected a checkpoint with the key 'ema', found {_some(keys)}", "unfit")
+        raise WeightsError(f"{path}: expected a checkpoint with the key 'ema', found {_list_some(keys)}", "unfit")
     return {name: value.clone() for name, value in checkpoint["ema"].items()}  # apart from the file
 
 
@@ -140,10 +140,10 @@ def _difference(expected: dict[str, tuple[int, ...]], found: dict[str, tuple[int
     other = [f"{n} {found[n]} for {expected[n]}" for n in sorted(expected) if found.get(n, expected[n]) != expected[n]]
     missing, unknown = sorted(expected.keys() - found.keys()), sorted(found.keys() - expected.keys())
     named = (("missing", missing), ("unknown", unknown), ("of another shape", other))
-    return "; ".join(f"{len(names)} {kind}: {_some(names)}" for kind, names in named if names)
+    return "; ".join(f"{len(names)} {kind}: {_list_some(names)}" for kind, names in named if names)
 
 
-def _some(names: list[str]) -> str:
+def _list_some(names: list[str]) -> str:
     return ", ".join(names[:5]) + (f" and {len(names) - 5} more" if len(names) > 5 else "")
 
 

@@ -8,7 +8,7 @@ from wiw.world_models.panoramic.served import ADDRESS, Served
 
 
 class PathDreamer(Served):
-    """PathDreamer, whose official code `server/shim.py` serves: panoramas with depth and semantics."""
+    """PathDreamer: panoramas with depth and semantics, from the official code served by `server/shim.py`."""
 
     accepts = accepts("viewpoint", needs=("depth", "semantic"), causal=True, best_batch=1, cacheable=True)
     requires = Requirements(

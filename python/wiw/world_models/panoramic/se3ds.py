@@ -8,7 +8,7 @@ from wiw.world_models.panoramic.served import ADDRESS, Served
 
 
 class SE3DS(Served):
-    """SE3DS, whose official code `server/shim.py` serves: panoramas with depth."""
+    """SE3DS: panoramas with depth, from the official code served by `server/shim.py`."""
 
     accepts = accepts("viewpoint", needs=("depth",), causal=True, best_batch=1, cacheable=True)
     requires = Requirements(

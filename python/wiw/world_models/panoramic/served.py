@@ -41,7 +41,7 @@ class Served(Remote):
         if served != self.requires.served or _list_inputs(self._accepts) != _list_inputs(type(self).accepts):
             self.close()
             raise RemoteError(
-                f"{address} serves {served}, not {self.requires.served} as this version of wiw knows it. "
+                f"{address} serves {served}, not {self.requires.served} as known to this version of wiw. "
                 f"{self._explain_start()}, or give another address",
                 "model",
             )

@@ -28,14 +28,14 @@ STEPS = 1
 
 
 class Pocket(Trained):
-    """Draw the views of a plan out of noise, together, by a diffusion model over small panoramas.
+    """Generate all views of a plan jointly with a diffusion model over small panoramas.
 
-    The model is told where each view is taken from. It draws views that face where the observation does; turns are
-    rolls of them, exact to a column. Views from where the agent stands are the observation itself. The model says how
-    warps of the observation through simple rooms are blended, and what to add; both are carried out in full size.
+    The model receives the place of each view. It draws views that face where the observation does; turns are rolls of
+    them, exact to a column. Views from the agent's present place are the observation itself. The model says how warps
+    of the observation through simple rooms are blended, and what to add; both are carried out in full size.
 
     Args:
-        weights: a file of `wiw train pocket`; None means those that come with wiw.
+        weights: a file of `wiw train pocket`; None means those shipped with wiw.
         steps: of the sampler: 1 gives the mean of what may be seen, more draw one
             of them, with blotches where it is uncertain.
 

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What goes over the wire: rows as a model accepts them, and no larger."""
+"""Limits of the connection: rows as a model accepts them, and no larger."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from wiw.wire.rows import Row
 from wiw.world_models.base import Accepts
 
 CONTROL_BYTES = 2**20
-"""Most bytes of a row beside its images."""
+"""Maximum size of a row beside its images in bytes."""
 
 
 def most_bytes(accepts: Accepts) -> int:
@@ -42,12 +42,12 @@ def check_row(row: Row, accepts: Accepts) -> None:
     if row.history is not None:
         _check_history(row.history, accepts, size)
     if (row.control.ids is not None) != (accepts.control == "action"):
-        raise RemoteError(f"row.ids: a model of control '{accepts.control}' and these ids do not fit", "row")
+        raise RemoteError(f"row.ids: these ids do not fit a model with control '{accepts.control}'", "row")
     if count < 1 or (accepts.frames and count != accepts.frames - 1):
         expected = accepts.frames - 1 if accepts.frames else "at least 1"
         raise RemoteError(f"row.actions: expected {expected} actions, got {count}", "row")
     if (count + 1) * row.image.size > MOST_BYTES - CONTROL_BYTES:
-        raise RemoteError(f"row.actions: {count} frames of {size} pixels are more than can be sent", "row")
+        raise RemoteError(f"row.actions: {count} frames of {size} pixels are too many to send", "row")
 
 
 def _check_history(history: History, accepts: Accepts, size: tuple[int, ...]) -> None:

@@ -18,7 +18,6 @@ from collections.abc import Sequence
 from concurrent.futures import Future
 from concurrent.futures import TimeoutError as LateError
 from dataclasses import dataclass, field
-from ipaddress import ip_address
 from pathlib import Path
 from typing import Any
 from urllib.parse import urlsplit
@@ -31,6 +30,7 @@ from websockets.exceptions import ConnectionClosed, InvalidStatus
 import wiw
 from wiw.errors import ContractError, RemoteError
 from wiw.wire.address_book import ServerAddress, read_addresses
+from wiw.wire.loopback import is_loopback
 from wiw.wire.messages import MOST_BYTES, Answer, Ask, Hello, Refusal, Wait, Welcome, decode, encode
 from wiw.wire.rows import row_id
 
@@ -115,7 +115,7 @@ class Link:
             lost: seconds without a connection after which it waits no longer either.
 
         Raises:
-            RemoteError: not all are there in time ("connection" where there is none), or the server refuses one.
+            RemoteError: not all are there in time ("connection" if there is none), or the server refuses one.
             ContractError: the served model broke its contract.
         """
         if self._closed:
@@ -135,7 +135,7 @@ class Link:
         """Return the answer to a question.
 
         Raises:
-            LateError: it did not come in time.
+            LateError: it did not arrive in time.
             RemoteError: the connection has been lost for too long.
         """
         while True:
@@ -146,10 +146,12 @@ class Link:
                 if left <= 0:
                     raise
                 if not self.is_connected and time.monotonic() - self._lost_at >= lost:
-                    raise RemoteError(f"{self.address} is gone: {self.last_error}", "connection") from None
+                    raise RemoteError(
+                        f"the connection to {self.address} was lost: {self.last_error}", "connection"
+                    ) from None
 
     def close(self) -> None:
-        """End the connection and the thread, and tell those who still wait."""
+        """End the connection and the thread, and fail the calls that still wait."""
         self._closed = True
         if self._thread.is_alive():
             self._call_soon(self._loop.stop)
@@ -157,13 +159,13 @@ class Link:
 
     def _build_closed_error(self) -> RemoteError:
         return RemoteError(
-            f"the connection to {self.address} was closed on this side; make the model anew", "connection"
+            f"the connection to {self.address} was closed on this side; create the model again", "connection"
         )
 
     def _build_deadline_error(self) -> RemoteError:
         if self._outbox is None:
             return RemoteError(f"{self.address} could not be reached in time: {self.last_error}", "connection")
-        return RemoteError(f"no answer from {self.address} in time; the server is there, but busy or hung", "deadline")
+        return RemoteError(f"no answer from {self.address} in time; the server is up, but busy or hung", "deadline")
 
     def _call_soon(self, work: Any) -> None:
         with contextlib.suppress(RuntimeError):  # closed: callers find out by their deadlines
@@ -195,7 +197,9 @@ class Link:
                 self._fail_all(error)
             except InvalidStatus as error:
                 if error.response.status_code in (401, 403) and self._given.address == self.address:
-                    self._fail_all(RemoteError(f"{self.address} wants another token: set WIW_TOKEN to it", "token"))
+                    self._fail_all(
+                        RemoteError(f"{self.address} expects a different token: set WIW_TOKEN to it", "token")
+                    )
                 self.last_error = f"{self.address}: {error}"
             except Exception as error:  # whatever it is, those who ask wait no longer than their deadlines
                 self.last_error = f"{type(error).__name__}: {error}"
@@ -212,7 +216,7 @@ class Link:
         return connect(
             server.address,
             additional_headers={} if server.token is None else {"Authorization": f"Bearer {server.token}"},
-            proxy=None if _is_loopback(server.address) else True,
+            proxy=None if is_loopback(urlsplit(server.address).hostname or "") else True,
             compression=None,
             max_size=MOST_BYTES,
             open_timeout=HANDSHAKE,
@@ -241,7 +245,8 @@ class Link:
         elif message != (first := self._welcome.result()):
             what = "weights or options" if (message.accepts, message.model) == (first.accepts, first.model) else "model"
             raise RemoteError(
-                f"{self.address} has come back with another {what} than this run began with; serve the same one again",
+                f"{self.address} has come back with different {what} than this run started with; serve the same model "
+                "again",
                 "model",
             )
 
@@ -302,7 +307,7 @@ class Link:
             if isinstance(message, Refusal) and not message.id:
                 raise RemoteError(f"{self.address}: {message.text}", message.kind)
             if not isinstance(message, Answer | Wait | Refusal):
-                raise RemoteError(f"{self.address}: did not expect a {type(message).__name__}", "message")
+                raise RemoteError(f"{self.address}: unexpected {type(message).__name__}", "message")
             room.release()
             asked.discard(message.id)
             question = self._open.get(message.id)
@@ -352,12 +357,3 @@ def _error(refusal: Refusal) -> Exception:
     if refusal.kind in BREACHES:
         return ContractError(refusal.text, refusal.kind)
     return RemoteError(refusal.text, refusal.kind)
-
-
-def _is_loopback(address: str) -> bool:
-    """Return whether the address is on this machine, where no proxy is used."""
-    host = urlsplit(address).hostname or ""
-    try:
-        return ip_address(host).is_loopback
-    except ValueError:
-        return host == "localhost"

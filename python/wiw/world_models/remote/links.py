@@ -36,20 +36,20 @@ class Links:
 
         Raises:
             RemoteError: one has not answered in time, or refuses; "model" where one serves another model than the
-                first, or a model without a version, which cannot be told from another.
+                first, or a model without a version, which cannot be distinguished from another.
         """
         give_up = time.monotonic() + seconds
         found = [link.welcome(max(0.0, give_up - time.monotonic())) for link in self._links]
         for link, welcome in zip(self._links, found, strict=True):
             if not welcome.fingerprint:
                 raise RemoteError(
-                    f"{link.address}: several servers are used only for a model that can be told from another: "
-                    f"{welcome.unknown or 'it has no version'}; give one address, or have one server",
+                    f"{link.address}: several servers can only be used for a model that can be identified: "
+                    f"{welcome.unknown or 'it has no version'}; give one address, or use one server",
                     "model",
                 )
             if (welcome.fingerprint, welcome.accepts) != (found[0].fingerprint, found[0].accepts):
                 raise RemoteError(
-                    f"{link.address} serves another model than {self._links[0].address}: fingerprint "
+                    f"{link.address} serves a different model than {self._links[0].address}: fingerprint "
                     f"{welcome.fingerprint}, expected {found[0].fingerprint}; serve the same weights and options",
                     "model",
                 )
@@ -83,7 +83,7 @@ class Links:
         """Return the numbers of the servers that are connected, as soon as there are any.
 
         Raises:
-            RemoteError: none has come back in time.
+            RemoteError: none has returned in time.
         """
         while True:
             for link in self._links:
@@ -119,7 +119,7 @@ class Links:
 
 
 def _take(left: deque[int], most: int) -> list[int]:
-    """Take up to so many places; several threads may do so at once."""
+    """Take up to this many places; several threads may do so at once."""
     own: list[int] = []
     while len(own) < most:
         try:

@@ -33,16 +33,16 @@ PATIENCE, PATIENCE_FOR_JOBS = 15.0, 270.0
 OVERHEAD = 1024
 """Bytes of a message beside its row."""
 MARGIN = 0.05
-"""Share of the caller's patience that is kept for telling it why there is no answer."""
+"""Share of the caller's time limit reserved for reporting why there is no answer."""
 
 
 class Remote(WorldModel):
-    """A served world model: "remote:ws://HOST:PORT", where `wiw serve MODEL` runs.
+    """A world model served by `wiw serve MODEL` at "remote:ws://HOST:PORT".
 
     Args:
         address: "ws://HOST:PORT", or "wss://..." for a server behind TLS; several with commas between them share the
-            rows of each call, and go on without one that dies. Or a folder in which servers of the same model announce
-            themselves (`wiw serve --announce FOLDER/NAME.json`).
+            rows of each call, and continue without one that dies. Or a folder in which servers of the same model
+            announce themselves (`wiw serve --announce FOLDER/NAME.json`).
         token: the server's; None means that of the environment variable WIW_TOKEN. Announced servers say theirs.
         patience: seconds that the first connection may take; 15 if not given, 270 for servers that are announced.
 
@@ -96,8 +96,8 @@ class Remote(WorldModel):
         ]
         if (longest := max(map(len, rows))) > (most := most_bytes(self.accepts) - OVERHEAD):
             raise RemoteError(
-                f"a row of {longest} bytes is more than the {most} that a server of this model takes; a smaller size, "
-                "or a shorter history if it needs one, makes it less",
+                f"a row of {longest} bytes exceeds the {most} that a server of this model accepts; use a smaller size, "
+                "or a shorter history if it needs one",
                 "row",
             )
         frames = np.empty((len(controls), 1 + len(controls[0].actions), *observations.image.shape[1:]), np.uint8)
@@ -110,11 +110,11 @@ class Remote(WorldModel):
         return frames
 
     def describe(self) -> dict[str, Any]:
-        """Return what is served, wherever that is: a run may go on with the same model at another address."""
+        """Return what is served, wherever that is: a run may continue with the same model at another address."""
         return {"name": "Remote", "model": self._described, "fingerprint": self._welcome.fingerprint or None}
 
     def fingerprint(self) -> str:
-        """Return the served model's own; empty where it declares no version."""
+        """Return the served model's own; empty if it declares no version."""
         return self._welcome.fingerprint
 
     def close(self) -> None:
@@ -155,5 +155,5 @@ def _check_address(address: str) -> str:
             f"got '{address}'"
         ) from None
     if uri.username or uri.query:
-        raise ArgumentError(f"remote: the address is written into records; put the token into {TOKEN} instead")
+        raise ArgumentError(f"remote: the address is stored in records; put the token into {TOKEN} instead")
     return address

@@ -30,18 +30,18 @@ SIDE = 960
 
 @dataclass(kw_only=True, eq=False)
 class RunwayGen4(WorldModel):
-    """Runway Gen-4: the front view and the plan in words become a clip, on Runway's servers, for money.
+    """Runway Gen-4: a clip from the front view and the plan in words, generated on Runway's servers for a fee.
 
     The key is read from the environment, RUNWAYML_API_SECRET. All rows of a call are begun at once and waited for
-    together. A row that the service has confirmed is never begun again: a repeated question goes on waiting for it.
+    together. A row that the service has confirmed is never begun again: a repeated request continues to wait for it.
 
     Args:
         model: "gen4_turbo", or "gen4.5".
         duration: seconds of a clip, 2 to 10; each costs credits.
         size: (height, width) of input and output, square and at most 960x960, which the service makes of it.
-        frames: of a rollout, the observation included: the most actions that a clip is asked to show, and one more.
+        frames: of a rollout, the observation included: the maximum number of actions that a clip is to show, plus one.
         batch: rows that are begun at once.
-        budget: credits after which nothing more is begun; None is without end.
+        budget: credits after which no more tasks are started; None means no limit.
         template, alignment: as of `TextVideoModel`; clips count as having `frames` frames.
         poll: seconds between two looks at the tasks.
         patience: seconds after which a task that has not ended counts as lost.
@@ -138,7 +138,7 @@ class RunwayGen4(WorldModel):
         prompt = write_prompt(control, self._words, self._alignment)
         if len(prompt.encode("utf-16-le")) > 2 * LONGEST_PROMPT:
             raise ArgumentError(
-                f"RunwayGen4: the service takes prompts of up to {LONGEST_PROMPT} characters, and {control.length} "
+                f"RunwayGen4: the service takes prompts of up to {LONGEST_PROMPT} characters, but {control.length} "
                 f"actions take {len(prompt)}; lower frames (now {self.frames})"
             )
         return {

@@ -21,7 +21,7 @@ class Tasks:
         url: of the service; the SDK's own choice if None.
         poll: seconds between two looks.
         patience: seconds after which a task that has not ended counts as lost.
-        budget: credits after which nothing more is begun.
+        budget: credits after which no more tasks are started.
 
     Raises:
         ArgumentError: no key in the environment.
@@ -64,15 +64,15 @@ class Tasks:
                 return [found[name] for name in names]
             if time.monotonic() > deadline:
                 raise InfrastructureError(
-                    f"RunwayGen4: {len(set(names)) - len(found)} tasks have not ended in {self._patience:g} s; the "
-                    "same question waits for them again, and patience= longer"
+                    f"RunwayGen4: {len(set(names)) - len(found)} tasks have not finished within {self._patience:g} s; "
+                    "repeating the request waits for them again, with a larger patience= for longer"
                 )
             time.sleep(self._poll)
 
     def _begin(self, order: Mapping[str, Any]) -> str:
         if self._budget is not None and self.credits >= self._budget:
             raise InfrastructureError(
-                f"RunwayGen4: {self.credits} credits are spent of budget={self._budget:g}; raise it to go on"
+                f"RunwayGen4: {self.credits} credits of budget={self._budget:g} are spent; raise it to continue"
             )
         return str(self._ask(self._client.image_to_video.create, **order).id)
 
@@ -89,7 +89,7 @@ class Tasks:
         raise InfrastructureError(f"RunwayGen4: task {task.id} ended as {task.status}{reason}")
 
     def _ask(self, call: Any, *values: Any, **named: Any) -> Any:
-        """Return an answer of the service; the SDK tries again by itself where that may help.
+        """Return an answer of the service; the SDK itself retries where that may help.
 
         Raises:
             InfrastructureError: it refused, or is out of reach.

@@ -29,7 +29,7 @@ def fetch_video(url: str, size: tuple[int, int]) -> NDArray[np.uint8]:
     """Return all frames of the video at an address, uint8 [T, H, W, 3] in (height, width) `size`.
 
     Raises:
-        InfrastructureError: it cannot be had, is larger than 256 MB, or is no video.
+        InfrastructureError: it cannot be downloaded, is larger than 256 MB, or is not a video.
     """
     if not url.startswith(("https://", "http://")):
         raise InfrastructureError(f"RunwayGen4: expected the address of a video, got '{url[:80]}'")
@@ -63,5 +63,5 @@ def decode_video(content: bytes, size: tuple[int, int]) -> NDArray[np.uint8]:
             frames.append(cv2.cvtColor(small, cv2.COLOR_BGR2RGB))
         video.release()
     if not frames:
-        raise InfrastructureError(f"RunwayGen4: {len(content)} bytes came that are no video")
+        raise InfrastructureError(f"RunwayGen4: {len(content)} bytes were received, which are not a video")
     return np.asarray(np.stack(frames), np.uint8)

@@ -20,12 +20,12 @@ HUB = "nvidia/Cosmos-Predict2-2B-Video2World"
 
 @dataclass(kw_only=True, eq=False)
 class CosmosPredict2(TextVideoModel):
-    """Cosmos-Predict2 2B: the front view and the plan in words become a clip (NVIDIA 2025).
+    """Cosmos-Predict2 2B: a clip from the front view and the plan in words (NVIDIA 2025).
 
     Args:
         guardrail: whether NVIDIA's filter looks at prompts and frames. It has to be said: the licence of the weights
-            ends for who takes the filter away without one of their own, and the filter is a package
-            (`cosmos_guardrail`) with gated weights and needs of its own.
+            terminates if the filter is removed without a substitute, and the filter is a package (`cosmos_guardrail`)
+            with its own gated weights and requirements.
         fps: frames a second that the clip is made for.
     """
 
@@ -46,8 +46,8 @@ class CosmosPredict2(TextVideoModel):
     def __post_init__(self) -> None:
         if not isinstance(self.guardrail, bool):
             raise ArgumentError(
-                "CosmosPredict2: say guardrail=True (NVIDIA's filter; pip install cosmos_guardrail) or guardrail=False "
-                "(without it; the licence of the weights asks for a filter of your own)"
+                "CosmosPredict2: choose guardrail=True (NVIDIA's filter; pip install cosmos_guardrail) or "
+                "guardrail=False (without it; the licence of the weights requires you to use your own filter)"
             )
         super().__post_init__()
 

@@ -22,15 +22,15 @@ DROPPED = 4
 
 @dataclass(kw_only=True, eq=False)
 class Hunyuan(TextVideoModel):
-    """HunyuanVideo I2V 13B: the front view and the plan in words become a clip (Kong et al. 2024).
+    """HunyuanVideo I2V 13B: a clip from the front view and the plan in words (Kong et al. 2024).
 
     Both kinds of checkpoint run: those that replace the first token by the observation, and those that concatenate it
-    (33 channels; use guidance=1 with them). The latter lose the first frames, so more are asked for, and the clip is
+    (33 channels; use guidance=1 with them). The latter lose the first frames, so more are requested, and the clip is
     sampled evenly from the observation to its end.
 
     Args:
-        negative_guidance: scale of guidance away from `negative_prompt`, above 1 where there is one: the networks run
-            twice. `guidance` is a number that they are told, and steers away from nothing.
+        negative_guidance: scale of guidance away from `negative_prompt`, above 1 if there is one: the networks run
+            twice. `guidance` is a number that they receive, not a contrast with a second prompt.
     """
 
     accepts = accepts(control="text", view="perspective", frames=33, cacheable=True)

@@ -54,7 +54,7 @@ def load_pipeline(model: Loadable, folder: Path, components: Mapping[str, Any]) 
         except (OSError, ValueError, KeyError, RuntimeError, _safetensors_error()) as error:
             raise WeightsError(
                 f"{folder} cannot be loaded as a {model.pipeline_class}: {type(error).__name__}: {error}; files may be "
-                f"missing, damaged, or of another variant than {model.variant}",
+                f"missing or damaged, or of a different variant than {model.variant}",
                 "unfit",
             ) from error
         _require_all_parameters(pipeline, folder)
@@ -83,7 +83,7 @@ def _require_all_parameters(pipeline: Any, folder: Path) -> None:
     ]
     if lacking:
         raise WeightsError(
-            f"{folder} lacks {len(lacking)} parameters, such as {lacking[0]}: fetch the weights again", "unfit"
+            f"{folder} lacks {len(lacking)} parameters, such as {lacking[0]}: download the weights again", "unfit"
         )
 
 

@@ -27,7 +27,7 @@ from wiw.world_models.base import Requirements
 ADAPTER = "lora"
 """Name of the LoRA in the pipeline."""
 METADATA = "lora_adapter_metadata"
-"""Where diffusers keeps rank and alpha."""
+"""The place where diffusers keeps rank and alpha."""
 _PREFIX = re.compile(r"^(?:pipe\.(?:dit|transformer)\.|base_model\.model\.|diffusion_model\.)+")
 _OTHER_DENOISER = re.compile(
     r"^(transformer(?:_2)?)\.(?=(?:transformer_)?blocks|single|condition|proj|time|patch|x_|norm)"
@@ -119,7 +119,7 @@ def require_layers(adapted: Mapping[str, Any], denoiser: Any, where: str) -> Non
     unfit = [layer for layer in layers if not _fits(adapted, layer, modules[layer].weight)]
     if unfit:
         raise WeightsError(
-            f"{where}: {len(unfit)} of {len(layers)} layers of the LoRA lack a side or are of other sizes than the "
+            f"{where}: {len(unfit)} of {len(layers)} layers of the LoRA lack one side or differ in size from the "
             f"network's: {_shorten(unfit)}",
             "unfit",
         )
@@ -143,11 +143,11 @@ def _read_file(file: Path) -> tuple[dict[str, Any], dict[str, Any] | None]:
             said = (content.metadata() or {}).get(METADATA)
         return tensors, None if said is None else dict(json.loads(said))
     except (OSError, SafetensorError, ValueError) as error:
-        raise WeightsError(f"{file} is damaged or no .safetensors file ({error})", "unfit") from error
+        raise WeightsError(f"{file} is damaged or not a .safetensors file ({error})", "unfit") from error
 
 
 def _select_metadata(metadata: Mapping[str, Any] | None, place: str) -> dict[str, Any] | None:
-    """Return what the file says of the denoiser's LoRA; None where it says nothing."""
+    """Return what the file says of the denoiser's LoRA; None if it says nothing."""
     prefixes = (f"{place}.", "transformer.")
     own = [
         {name.removeprefix(prefix): value for name, value in (metadata or {}).items() if name.startswith(prefix)}
@@ -162,7 +162,7 @@ def _select_denoiser(tensors: Mapping[str, Any], place: str, file: Path) -> dict
     places = set(named.values())
     wanted = place if place in places or len(places) > 1 else next(iter(places), place)
     if places and wanted not in places:
-        raise WeightsError(f"{file} has a LoRA of {', '.join(sorted(places))}, and none of {place}", "unfit")
+        raise WeightsError(f"{file} has a LoRA of {', '.join(sorted(places))}, but none of {place}", "unfit")
     return {
         name.removeprefix(f"{wanted}."): value
         for name, value in tensors.items()

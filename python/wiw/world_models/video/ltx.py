@@ -18,7 +18,7 @@ HUB = "Lightricks/LTX-Video"
 
 @dataclass(kw_only=True, eq=False)
 class LTX(TextVideoModel):
-    """LTX-Video 2B: the front view and the plan in words become a clip (HaCohen et al. 2024).
+    """LTX-Video 2B: a clip from the front view and the plan in words (HaCohen et al. 2024).
 
     Decoders since 0.9.1 take away the last bit of noise themselves. The pipeline draws it from one generator, where the
     decoder is, so it takes one row at a time with them.

@@ -24,7 +24,7 @@ from wiw.world_models.video.weights import fetch_weights, require_kind
 Clips = NDArray[np.float32]
 """float32 [rows, frames, H, W, 3] from 0 to 1."""
 PACKAGES = ("torch", "diffusers", "transformers", "accelerate")
-"""What every pipeline needs."""
+"""Requirements of every pipeline."""
 T = TypeVar("T", bound="VideoModel")
 
 
@@ -46,7 +46,7 @@ class VideoModel(WorldModel):
         weights: folder in the layout of `save_pretrained`, or name on the Hugging Face hub.
         revision: branch, tag or commit on the hub; pin a commit to run the same weights for ever.
         variant: of the weight files, such as "fp16".
-        device: of torch; "cuda" where there is one, else "cpu".
+        device: of torch; "cuda" if there is one, else "cpu".
         precision: of the weights; the model's usual half precision on a GPU, float32 on the CPU.
         offload: "model" keeps on the GPU only the network at work, "sequential" only the layer: less memory, slower.
         steps: denoising steps.
@@ -78,7 +78,7 @@ class VideoModel(WorldModel):
     network_precisions: ClassVar[Mapping[str, Precision]] = {}
     """Networks that run in another precision where the others run in `half_precision`."""
     multiple: ClassVar[int] = 16
-    """What height and width are multiples of."""
+    """Height and width must be multiples of this."""
     stride: ClassVar[int] = 1
     """Frames that the autoencoder makes one of: clips have a multiple of it, and one more."""
     max_batch: ClassVar[int] = 1
@@ -88,7 +88,7 @@ class VideoModel(WorldModel):
     immaterial: ClassVar[tuple[str, ...]] = ("weights", "revision", "offload", "batch")
     """Options that frames do not depend on: where the weights lie, which have a digest, and how they are run."""
     wording_options: ClassVar[tuple[str, ...]] = ()
-    """Options on how a plan is put into words and shown, which a model that is told actions does not have."""
+    """Options on how a plan is put into words and shown, which a model conditioned on actions does not have."""
 
     weights: str
     revision: str | None = None
@@ -178,7 +178,7 @@ class VideoModel(WorldModel):
         return frames_after_actions(control.length, self.frames, self.frames)
 
     def batches(self, rows: int) -> Iterator[slice]:
-        """Yield the slices of so many rows that the pipeline takes in one call each."""
+        """Yield the slices of rows that the pipeline takes in one call each."""
         for first in range(0, rows, self.batch):
             yield slice(first, first + self.batch)
 

@@ -22,7 +22,7 @@ OPENCV = np.diag([1.0, -1.0, -1.0, 1.0])
 
 @dataclass(kw_only=True, eq=False)
 class SanaWM(VideoModel):
-    """SANA-WM: the front view and the camera's path become a clip (NVIDIA 2026).
+    """SANA-WM: a clip from the front view and the camera's path (NVIDIA 2026).
 
     The path is interpolated to one pose a frame.
 

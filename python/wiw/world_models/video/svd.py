@@ -16,13 +16,13 @@ HUB = "stabilityai/stable-video-diffusion-img2vid"
 
 @dataclass(kw_only=True, eq=False)
 class SVD(VideoModel):
-    """Stable Video Diffusion: the front view comes to life; the plan does not steer it (Blattmann et al. 2023).
+    """Stable Video Diffusion: a clip from the front view; the plan does not control it (Blattmann et al. 2023).
 
-    Frame k of the clip stands for what follows action k.
+    Frame k of the clip is the view after action k.
 
     Args:
         fps: frames a second that the clip is made for.
-        motion: how much moves, from 1 to 255 (`motion_bucket_id`).
+        motion: the amount of motion, from 1 to 255 (`motion_bucket_id`).
         noise: standard deviation of the noise on the observation; more of it, more motion.
     """
 

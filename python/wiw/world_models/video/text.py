@@ -26,7 +26,7 @@ SIZES: Mapping[str, tuple[int, int]] = {"perspective": (480, 480), "panorama": (
 
 @dataclass(kw_only=True, eq=False)
 class TextVideoModel(VideoModel):
-    """The base of models that are told the plan in words.
+    """The base of models that take the plan in words.
 
     Args:
         view: "perspective", or "panorama" for weights or a LoRA that were trained on panoramas.

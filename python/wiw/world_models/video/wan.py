@@ -20,7 +20,7 @@ HUB_22_A14B = "Wan-AI/Wan2.2-I2V-A14B-Diffusers"
 
 @dataclass(kw_only=True, eq=False)
 class Wan(TextVideoModel):
-    """The front view and the plan in words become a clip (Wan team 2025)."""
+    """A clip from the front view and the plan in words (Wan team 2025)."""
 
     accepts = accepts(control="text", view="perspective", frames=25, cacheable=True)
     pipeline_class = "WanImageToVideoPipeline"
@@ -39,7 +39,7 @@ class Wan(TextVideoModel):
 
 @dataclass(kw_only=True, eq=False)
 class Wan21(Wan):
-    """Wan 2.1 I2V 14B: the front view and the plan in words become a clip (Wan team 2025)."""
+    """Wan 2.1 I2V 14B: a clip from the front view and the plan in words (Wan team 2025)."""
 
     requires = declare_requirements(HUB_21, packages=("ftfy",))
     index_flags = {"expand_timesteps": False, "boundary_ratio": False}  # noqa: RUF012
@@ -49,7 +49,7 @@ class Wan21(Wan):
 
 @dataclass(kw_only=True, eq=False)
 class Wan22Small(Wan):
-    """Wan 2.2 TI2V 5B: the front view and the plan in words become a clip (Wan team 2025)."""
+    """Wan 2.2 TI2V 5B: a clip from the front view and the plan in words (Wan team 2025)."""
 
     requires = declare_requirements(HUB_22_5B, packages=("ftfy",))
     compatible_pipelines = ("WanPipeline",)
@@ -61,7 +61,7 @@ class Wan22Small(Wan):
 
 @dataclass(kw_only=True, eq=False)
 class Wan22(Wan):
-    """Wan 2.2 I2V A14B: the front view and the plan in words become a clip (Wan team 2025).
+    """Wan 2.2 I2V A14B: a clip from the front view and the plan in words (Wan team 2025).
 
     Two experts share the work: one for the noisy steps, one for the others.
 

@@ -35,7 +35,7 @@ class Weights:
 
     folder: Path
     identity: Mapping[str, str]
-    """What tells the weights from others: "commit" on the hub, or "digest" of a folder of the user's own."""
+    """An identifier of the weights: "commit" on the hub, or "digest" of a folder of the user's own."""
 
 
 def fetch_weights(
@@ -46,13 +46,13 @@ def fetch_weights(
     `components` are parts that the folder need not have.
 
     Raises:
-        WeightsError: there is no such folder, repository or revision, or it may not be read.
+        WeightsError: the folder, repository or revision does not exist, or may not be read.
         ArgumentError: a revision of a folder.
     """
     folder = Path(name).expanduser()
     if folder.is_dir():
         if revision is not None:
-            raise ArgumentError(f"revision: '{revision}' names a state of a hub repository, but {folder} is a folder")
+            raise ArgumentError(f"revision: '{revision}' is a revision of a hub repository, but {folder} is a folder")
         return Weights(folder, {"digest": digest_folder(folder)})
     if is_path(name):
         raise WeightsError(f"no folder {folder.resolve()}; give the folder of a pipeline, or its name on the hub")
@@ -76,7 +76,8 @@ def require_kind(folder: Path, pipelines: Sequence[str], flags: Mapping[str, boo
     index = folder / "model_index.json"
     if not index.is_file():
         raise WeightsError(
-            f"{folder} has no model_index.json: expected a folder in the layout of diffusers, as save_pretrained writes"
+            f"{folder} has no model_index.json: expected a folder in the layout of diffusers, as written by "
+            "save_pretrained"
         )
     try:
         content = json.loads(index.read_text(encoding="utf-8"))
@@ -85,7 +86,7 @@ def require_kind(folder: Path, pipelines: Sequence[str], flags: Mapping[str, boo
     found = {name: content.get(name) for name in ("_class_name", *flags)}
     if found["_class_name"] not in pipelines or any(bool(found[name]) != flag for name, flag in flags.items()):
         wanted = {"_class_name": " or ".join(pipelines), **{name: flag or None for name, flag in flags.items()}}
-        raise WeightsError(f"{folder} holds another model: expected {wanted}, found {found}", "unfit")
+        raise WeightsError(f"{folder} contains a different model: expected {wanted}, found {found}", "unfit")
 
 
 def digest_folder(folder: Path) -> str:

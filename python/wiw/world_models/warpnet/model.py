@@ -32,14 +32,14 @@ def _accepts(size: tuple[int, int] | None = None) -> Accepts:
 
 
 class WarpNet(Trained):
-    """Guess how far away everything will be, warp the panorama by that, and paint what the warp cannot know.
+    """Predict the depth of the new panorama, warp the present one by it, and inpaint what the warp cannot know.
 
     Where a plan leads is one jump (turn towards the place, go straight, turn back), however many primitives it takes,
     so errors do not add up. Turns are rolls of the panorama, exact to a column. Colours come from the panorama in full
     size; distances and painting are the network's, in a small one.
 
     Args:
-        weights: a file of `wiw train warpnet`; None means those that come with wiw.
+        weights: a file of `wiw train warpnet`; None means those shipped with wiw.
         size: (height, width) of panoramas in and out; 576x1024 if not given. 144x256, all that the matcher reads, takes
             a third of the time. Results differ a little between sizes.
 

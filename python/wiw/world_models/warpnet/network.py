@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """The network: what a panorama shows from d metres further ahead.
 
-One network guesses how far away everything will be, geometry looks up where it is now, another network mends what
+One network guesses how far away everything will be, geometry looks up where it is now, another network repairs what
 geometry cannot know. Panoramas are float [B, C, H, W] with colours in [-1, 1]; their columns wrap.
 """
 
@@ -30,7 +30,7 @@ class Prediction:
     painted: Tensor
     """[B, 3, h, w]: what should be seen where they are wrong."""
     mask: Tensor
-    """[B, 1, h, w] in [0, 1]: how much of `painted` is seen."""
+    """[B, 1, h, w] in [0, 1]: the weight of `painted`."""
 
     @property
     def colours(self) -> Tensor:
@@ -84,7 +84,7 @@ def warp(source: Tensor, log_distance: Tensor, ahead: Tensor, right: Tensor | No
 
 
 def wrap_columns(panorama: Tensor, columns: int) -> Tensor:
-    """Add so many columns of the other end on each side."""
+    """Pad each side with columns of the other end."""
     return torch.cat([panorama[..., -columns:], panorama, panorama[..., :columns]], dim=-1)
 
 

@@ -74,7 +74,7 @@ def convert_latex(text: str, place: Callable[[int], str]) -> str:
         except _UnknownLatexError as error:
             raise PromptError(f"{place(match.start())}: {error}") from None
     if writer.closers or writer.lists:
-        raise PromptError(f"{place(len(text))}: a brace or a list does not end")
+        raise PromptError(f"{place(len(text))}: a brace or a list is not closed")
     return writer.text()
 
 
@@ -90,7 +90,7 @@ class _Writer:
     closers: list[str] = field(default_factory=list)
     """Text to write where each open brace ends."""
     lists: list[int | None] = field(default_factory=list)
-    """For each list that is open: its latest number, or None where it has dashes."""
+    """For each list that is open: its latest number, or None if it has dashes."""
     pending: str | None = None
     """Mark of a command that waits for its argument."""
 
@@ -129,9 +129,7 @@ class _Writer:
         if environment in LISTS:
             self.lists.append(0 if environment == "enumerate" else None)
         elif environment not in PLAIN:
-            raise _UnknownLatexError(
-                f"environment '{environment}' is not known; expected {', '.join((*LISTS, *PLAIN))}"
-            )
+            raise _UnknownLatexError(f"unknown environment '{environment}'; expected {', '.join((*LISTS, *PLAIN))}")
 
     def _leave(self, environment: str) -> None:
         if environment in LISTS:
@@ -158,11 +156,11 @@ class _Writer:
         elif command in BREAKS:
             self._break(empty=True)
         elif command not in IGNORED:
-            raise _UnknownLatexError(f"command \\{command} is not known; write what it stands for into your copy")
+            raise _UnknownLatexError(f"unknown command \\{command}; replace it by its meaning in your copy")
 
     def _close(self) -> None:
         if not self.closers:
-            raise _UnknownLatexError("a brace closes that none has opened")
+            raise _UnknownLatexError("a closing brace has no opening brace")
         self.lines[-1] += self.closers.pop()
 
     def _break(self, empty: bool = False) -> None:

@@ -34,7 +34,7 @@ NAMED: dict[str, tuple[str, ...]] = {
 NUMBERED: dict[str, tuple[str, ...]] = {
     "manipulation/planner": ("position_bins", "position_bins", "rotation_bins", "rotation_degrees", ""),
 }
-"""The slots `{}` of a template, in order; the empty one is for examples, which are a template of their own."""
+"""The slots `{}` of a template, in order; the empty one is for examples, which are a separate template."""
 ANSWER_FORMS = {
     "aeqa/low_level_planner": """
 Actions:
@@ -45,7 +45,7 @@ Reply with one JSON object and nothing else:
 {"reason": "<your reason>", "actions": [{"action": "<action>", "times": <1 to {{ action_times }}>}, ...]}
 """
 }
-"""How the answer is written, for templates without another that says it."""
+"""Format of the answer, for templates without another one for it."""
 _SLOT = re.compile(r"(?P<open>\{\{)|(?P<close>\}\})|\{(?P<named>[A-Za-z_]\w*)\}|(?P<numbered>\{\})|<(?P<angled>\w+)>")
 
 

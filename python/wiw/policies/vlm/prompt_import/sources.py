@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Where the paper's prompts stand: in boxes of its LaTeX source, or in files of its published code."""
+"""Sources of the paper's prompts: in boxes of its LaTeX source, or in files of its published code."""
 
 from __future__ import annotations
 
@@ -122,7 +122,8 @@ def name_template(title: str) -> str | None:
 def _require_new(found: Mapping[str, FoundPrompt], own: Mapping[str, FoundPrompt]) -> None:
     for name in own.keys() & found.keys():
         raise PromptError(
-            f"{own[name].place}: a second prompt for {name}; the first is at {found[name].place}; give one of the files"
+            f"{own[name].place}: a second prompt for {name}; the first is at {found[name].place}; give only one of the "
+            "files"
         )
 
 
@@ -147,7 +148,7 @@ def _join_files(files: list[Path]) -> FoundPrompt:
 
 
 def _read_variables(file: Path) -> dict[str, FoundPrompt]:
-    """Return the prompts that a Python file assigns as plain strings; nothing of it is run."""
+    """Return the prompts that a Python file assigns as plain strings; none of it is run."""
     try:
         tree = ast.parse(_read_text(file))
     except SyntaxError as error:

@@ -17,14 +17,14 @@ from numpy.typing import NDArray
 from wiw.mapping.landmarks import Landmark
 from wiw.mapping.marks import MarkedViews
 from wiw.mapping.views import VIEW_NAMES
-from wiw.policies.vlm import shorten
-from wiw.policies.vlm.plans import PRIMITIVES
+from wiw.policies.vlm.plans import PRIMITIVES, allow_several, list_plans
+from wiw.policies.vlm.policy import shorten
 
 if TYPE_CHECKING:
     from pydantic import BaseModel
 
 WALK_ACTIONS, WALK_TIMES = 4, 4
-"""Most different actions of a walk, and most times that each is repeated, as in the published code."""
+"""Maximum number of different actions in a walk, and of repetitions of each, as in the published code."""
 STOP = "stop"
 WALK_NAMES = (*PRIMITIVES, STOP)
 LONGEST_ANSWER = 300
@@ -40,15 +40,15 @@ class Command:
     plan: str
     """In its words."""
     view: int
-    """Number of the view to go on in."""
+    """Number of the view to continue in."""
     mark: int | None = None
-    """Number of the landmark in the pictures; None where the words alone say what to do."""
+    """Number of the landmark in the pictures; None if the words alone say what to do."""
     landmark: Landmark | None = None
     answer: str = ""
-    """Answer to the question; empty where it cannot be answered yet."""
+    """Answer to the question; empty if it cannot be answered yet."""
 
     def to_prompt(self) -> dict[str, Any]:
-        """Return the command as models write it, for the prompts that come after it."""
+        """Return the command as models write it, for later prompts."""
         return {"action_plan": self.plan, "chosen_view": VIEW_NAMES[self.view], "chosen_landmark": self.mark}
 
 
@@ -58,7 +58,7 @@ def command_schema(marks: tuple[int, ...], count: int = 1, answers: bool = True)
 
     Args:
         marks: numbers of the landmarks that may be chosen.
-        count: how many commands are asked for.
+        count: how many commands are requested.
         answers: whether a command comes with an answer; not where imagined views are shown.
     """
     from pydantic import ConfigDict, Field, create_model, field_validator
@@ -77,11 +77,7 @@ def command_schema(marks: tuple[int, ...], count: int = 1, answers: bool = True)
         "read_landmark": field_validator("chosen_landmark", mode="before")(_read_number),
         "read_answer": field_validator("answer", mode="before", check_fields=False)(_read_null),
     }
-    command = create_model("Command", __config__=strict, __validators__=loose, **fields)
-    if count == 1:
-        return command
-    plans: Any = (list[command], Field(min_length=1, max_length=count))  # type: ignore[valid-type]
-    return create_model("Commands", __config__=strict, plans=plans)
+    return allow_several(create_model("Command", __config__=strict, __validators__=loose, **fields), count)
 
 
 @lru_cache(maxsize=1)
@@ -113,7 +109,7 @@ def parse_commands(value: Any, marked: MarkedViews) -> list[Command]:
 
     A landmark has one number in all views, so that it counts where another view was named beside it.
     """
-    return [_parse_command(each, marked) for each in getattr(value, "plans", None) or [value]]
+    return [_parse_command(each, marked) for each in list_plans(value)]
 
 
 def parse_walk(value: Any) -> NDArray[np.int8]:
@@ -127,7 +123,7 @@ def parse_walk(value: Any) -> NDArray[np.int8]:
 
 
 def parse_answer(value: Any) -> str:
-    """Return the answer of a validated reply; empty where there is none."""
+    """Return the answer of a validated reply; empty if there is none."""
     return shorten(getattr(value, "answer", None) or "")
 
 

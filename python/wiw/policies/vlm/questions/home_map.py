@@ -19,7 +19,7 @@ from wiw.perception.scene_labels import STATES, SceneLabels
 from wiw.types import Observation
 
 UNMARKED = (*BACKGROUND, "opening")
-"""Categories that are no landmarks. Openings are found by depth, which is surer than labels."""
+"""Categories that are not landmarks. Openings are found by depth, which is surer than labels."""
 MOVED = 0.05
 """Metres below which a walk has led nowhere."""
 
@@ -42,7 +42,7 @@ class HomeMap:
     grid: OccupancyGrid = field(default_factory=OccupancyGrid)
     finder: LandmarkFinder = field(default_factory=LandmarkFinder)
     _pose: NDArray[np.float64] | None = None
-    """Where the latest observation was made."""
+    """Place of the latest observation."""
 
     def __post_init__(self) -> None:
         self.objects = ObjectMap(self.categories, STATES, UNMARKED)
@@ -77,6 +77,6 @@ class HomeMap:
 
 
 def find_named(landmarks: Sequence[Landmark], question: str) -> list[int]:
-    """Return the ids of the landmarks whose category stands in a question."""
+    """Return the ids of the landmarks whose category is mentioned in a question."""
     words = question.casefold()
     return [mark.id for mark in landmarks if mark.category.casefold() in words]

@@ -26,9 +26,9 @@ class Sight(NamedTuple):
     """View of a memory from a place."""
 
     features: NDArray[Any]
-    """[H, W, ...]: of the nearest point in each pixel, 0 where there is none."""
+    """[H, W, ...]: of the nearest point in each pixel, 0 if there is none."""
     depth: NDArray[np.float32]
-    """float32 [H, W]: its distance, 1 where there is none."""
+    """float32 [H, W]: its distance, 1 if there is none."""
     seen: NDArray[np.bool_]
     """bool [H, W]: whether there is one."""
 

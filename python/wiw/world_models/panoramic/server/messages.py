@@ -20,9 +20,9 @@ VERSION = 1
 VIEW = (576, 1024)
 """Height and width of wiw's panoramas."""
 ITEMS = 32
-"""Most entries of a map or list, and most maps and lists of a message."""
+"""Maximum number of entries in a map or list, and of maps and lists in a message."""
 ACTIONS = 128
-"""Most of a row, so that its answer can be sent."""
+"""Maximum size of a row, so that its answer can be sent."""
 DTYPES = frozenset(("|b1", "|u1", "|i1", "<u2", "<i2", "<u4", "<i4", "<u8", "<i8", "<f4", "<f8"))
 MESSAGES: dict[str, dict[str, type]] = {
     "hello": {"software": str},
@@ -67,7 +67,7 @@ def decode(data: Any) -> tuple[str, dict[str, Any]]:
     values = unpack("message", data)
     version, kind = values.pop("v", None), values.pop("type", None)
     if version != VERSION or type(version) is not int:
-        raise RefusedError("version", f"this side speaks version {VERSION} of the protocol, the other one another")
+        raise RefusedError("version", f"this side speaks version {VERSION} of the protocol, the other a different one")
     if not isinstance(kind, str) or kind not in MESSAGES:
         raise RefusedError("message", f"expected a message of type {' or '.join(MESSAGES)}")
     fields = MESSAGES[kind]
@@ -99,7 +99,7 @@ def unpack(what: str, data: Any) -> dict[Any, Any]:
     try:
         values = msgpack.unpackb(data, raw=False, list_hook=count, object_hook=count, **limits)
     except Exception as error:  # msgpack raises ValueError and others besides
-        raise RefusedError("message", f"{what}: no msgpack: {type(error).__name__}: {error}") from None
+        raise RefusedError("message", f"{what}: not valid msgpack: {type(error).__name__}: {error}") from None
     if not isinstance(values, dict):
         raise RefusedError("message", f"{what}: expected a map")
     return values

@@ -64,7 +64,7 @@ class Network(ABC):
 
     def __init__(self, code: Path, weights: Path, noise: bool) -> None:
         if noise and not self.takes_noise:
-            raise MissingError(f"{self.name} draws nothing at random: leave --noise out")
+            raise MissingError(f"{self.name} has no randomness: leave --noise out")
         self.noise = noise
         self._code, self._weights = code, weights
         self._checkpoints: list[Path] = []

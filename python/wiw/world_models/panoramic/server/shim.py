@@ -41,7 +41,7 @@ IN_FLIGHT = 4
 QUEUE = 64
 """Rows of all clients that may wait."""
 KNOWN_BYTES = 256 * 2**20
-"""Most bytes of answers that are kept for clients that ask again because they never got them."""
+"""Maximum size in bytes of answers kept for clients that ask again because they never got them."""
 _log = logging.getLogger("shim.connections")
 _log.addHandler(logging.NullHandler())
 _log.propagate = False  # every stranger who connects would write a line
@@ -107,7 +107,7 @@ class Server:
             job = self._jobs[name]
             try:
                 if not job.askers or job.expires < time.monotonic():
-                    raise RefusedError("deadline", "the row was not begun in time")
+                    raise RefusedError("deadline", "the row was not started in time")
                 answer = await loop.run_in_executor(self._thread, self._compute, name, job.row)
                 self._keep(name, answer)
             except RefusedError as error:
@@ -158,7 +158,7 @@ class Server:
                 if kind != "ask" or name != blake2b(said["row"], digest_size=16).digest():
                     raise RefusedError("message", "expected an ask whose id is the digest of its row")
                 if name in tasks:
-                    raise RefusedError("message", "a row was asked for twice on one connection")
+                    raise RefusedError("message", "a row was requested twice on one connection")
                 reason = self._full(tasks)
                 if reason:
                     await client.send(encode("wait", id=name, seconds=0.5, reason=reason))
@@ -180,7 +180,7 @@ class Server:
         task.add_done_callback(lambda _: tasks.pop(name, None))
 
     def _full(self, tasks: dict[bytes, Any]) -> str:
-        """Return why no row of a client is taken now; empty where one is."""
+        """Return why no row of a client is taken now; empty if one is."""
         if len(tasks) >= IN_FLIGHT:
             return "too many rows unanswered"
         return "the queue is full" if len(self._jobs) >= QUEUE else ""
@@ -250,7 +250,7 @@ def main() -> int:
     options = _options()
     token = options.token or os.environ.get("WIW_TOKEN", "")
     if not token and not _is_loopback(options.host):
-        return _fail(f"{options.host} can be reached by others than this machine: set WIW_TOKEN to a secret")
+        return _fail(f"{options.host} can be reached from other machines: set WIW_TOKEN to a secret")
     try:
         network = NETWORKS[options.model](options.code.expanduser(), options.weights.expanduser(), options.noise)
     except MissingError as error:
@@ -278,10 +278,10 @@ def _options() -> argparse.Namespace:
     parser.add_argument("model", choices=sorted(NETWORKS))
     parser.add_argument("--code", type=Path, required=True, help="folder of the official repository")
     parser.add_argument("--weights", type=Path, required=True, help="folder with its checkpoints")
-    parser.add_argument("--noise", action="store_true", help="draw what cannot be known, by the row's seed")
+    parser.add_argument("--noise", action="store_true", help="sample what cannot be known, using the row's seed")
     parser.add_argument("--host", default="127.0.0.1")
-    parser.add_argument("--port", type=int, default=PORT, help="0 takes a free one")
-    parser.add_argument("--token", default="", help="what clients must show; better in WIW_TOKEN")
+    parser.add_argument("--port", type=int, default=PORT, help="port to listen on; 0 picks a free one")
+    parser.add_argument("--token", default="", help="secret that clients must send; better given as WIW_TOKEN")
     return parser.parse_args()
 
 

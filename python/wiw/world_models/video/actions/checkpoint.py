@@ -37,7 +37,7 @@ def save(
     """Write a checkpoint.
 
     Args:
-        folder: where to; made if it is not there.
+        folder: where to; made if it does not exist.
         encoders: one for each denoiser, by its place in the pipeline ("unet", "transformer", "transformer_2").
         pipeline: holds the trained denoisers.
         lora: write their LoRA (peft's adapter "actions") instead of all their weights.
@@ -46,12 +46,12 @@ def save(
         ArgumentError: encoders of different configurations, or a LoRA for a pipeline that takes none.
     """
     if lora and not supports_lora(pipeline):
-        raise ArgumentError(f"{type(pipeline).__name__} takes no LoRA: write its denoiser whole (lora=False)")
+        raise ArgumentError(f"{type(pipeline).__name__} does not support LoRA: save its whole denoiser (lora=False)")
     folder = Path(folder)
     folder.mkdir(parents=True, exist_ok=True)
     configs = {encoder.config for encoder in encoders.values()}
     if len(configs) != 1:
-        raise ArgumentError("a checkpoint has one configuration, but its encoders have others")
+        raise ArgumentError("a checkpoint has one configuration, but its encoders have different ones")
     configs.pop().save(folder)
     tensors = {
         f"{place}.{name}": value.contiguous().cpu()
@@ -102,8 +102,8 @@ def has_lora(folder: Path, places: Sequence[str], pipeline: type) -> bool:
         return False
     other = f"or {' and '.join(loras)}" if supports_lora(pipeline) else f"since {pipeline.__name__} takes no LoRA"
     raise WeightsError(
-        f"{folder} holds no trained denoiser: expected {' and '.join(f'{place}/' for place in places)}, as "
-        f"save_pretrained writes, {other}"
+        f"{folder} holds no trained denoiser: expected {' and '.join(f'{place}/' for place in places)}, as written by "
+        f"save_pretrained, {other}"
     )
 
 
@@ -115,7 +115,7 @@ def load_encoders(folder: Path, config: ActionConfig, places: Sequence[str]) -> 
     """
     file = folder / ENCODERS
     if not file.is_file():
-        raise WeightsError(f"no {file}; a checkpoint has one beside its config.json")
+        raise WeightsError(f"no {file}; a checkpoint has one next to its config.json")
     try:
         tensors = load_file(file)
     except SafetensorError as error:

@@ -72,13 +72,13 @@ class ActionConfig:
         """Read `config.json`.
 
         Raises:
-            WeightsError: it is not there, damaged, or of another format.
+            WeightsError: it is missing, damaged, or of another format.
         """
         file = folder / FILE
         if not file.is_file():
             raise WeightsError(
-                f"no {file}: expected the folder of an action-conditioned checkpoint; an action-conditioned model "
-                "has no weights but those that you train"
+                f"no {file}: expected the folder of an action-conditioned checkpoint; action-conditioned models have "
+                "no weights except those that you train"
             )
         try:
             content = json.loads(file.read_text(encoding="utf-8"))

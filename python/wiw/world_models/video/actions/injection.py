@@ -39,7 +39,7 @@ class Injection:
             self._vectors = None
 
     def remove(self) -> None:
-        """Take the hooks away; the denoiser is what it was."""
+        """Take the hooks away; the denoiser is unchanged."""
         for handle in self._handles:
             handle.remove()
         self._handles = ()
@@ -55,7 +55,7 @@ class Injection:
         Guidance stacks its passes, [B, B, ...], so the vectors are repeated; places of one latent frame lie together.
 
         Raises:
-            ArgumentError: rows or places that are no multiple of the vectors'.
+            ArgumentError: rows or places that are not a multiple of the vectors'.
         """
         assert self._vectors is not None
         batch, frames = self._vectors.shape[:2]
@@ -69,7 +69,7 @@ class Injection:
 
 
 def hook_svd(denoiser: Any, injection: Injection) -> list[Any]:
-    """Add to the time embedding that every block is handed, [B F, D]."""
+    """Add to the time embedding that every block is given, [B F, D]."""
 
     def add_actions(_: Any, args: tuple[Any, ...], kwargs: dict[str, Any]) -> Any:
         if injection.idle:

@@ -27,7 +27,7 @@ if TYPE_CHECKING:
 
 PANORAMA = (576, 1024)
 POSES = {"space": GRIPPER_POSES, "view": "perspective", "null_first": False}
-"""What a model of poses accepts otherwise than one of primitives."""
+"""How the inputs of a model of poses differ from those of a model of primitives."""
 
 
 class ActionConditioned(WorldModel):
@@ -45,7 +45,7 @@ class ActionConditioned(WorldModel):
 
     Raises:
         TypeError: an option that the generator does not have.
-        WeightsError: the checkpoint cannot be had, or belongs to another generator; see also `VideoModel`.
+        WeightsError: the checkpoint cannot be loaded, or belongs to another generator; see also `VideoModel`.
     """
 
     accepts = accepts(control="action", null_first=True, cacheable=True)
@@ -98,7 +98,7 @@ class ActionConditioned(WorldModel):
         config, stride = ActionConfig.load(self._folder), self.generator_class.stride
         if config.base != self.base or config.stride != stride:
             raise WeightsError(
-                f"{self._folder} was trained for {config.base} with {config.stride} frames a latent, but this is "
+                f"{self._folder} was trained for {config.base} with {config.stride} frames per latent, but this is "
                 f"{self.base} with {stride}; use the world model {config.base}-action",
                 "unfit",
             )
@@ -115,7 +115,7 @@ class ActionConditioned(WorldModel):
         return load_denoisers(self._folder, self.denoisers, getattr(torch, str(generator.precision)))
 
     def _condition_denoisers(self) -> ActionConditioning:
-        """Put the LoRA, where there is one, and the encoders into the generator's pipeline."""
+        """Put the LoRA, if there is one, and the encoders into the generator's pipeline."""
         from wiw.world_models.video.actions.checkpoint import load_encoders, load_lora
         from wiw.world_models.video.actions.conditioning import ActionConditioning
         from wiw.world_models.video.actions.injection import embedding_width

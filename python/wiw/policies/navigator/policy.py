@@ -1,9 +1,9 @@
 # SPDX-License-Identifier: Apache-2.0
 """A policy with a belief: a trained network says of each place, seen or imagined, how far the goal is and where.
 
-What all places say is put together on a map, whose unknown parts count as floor. Plans are routes towards where the
-goal may be, and their worth is how soon they would arrive, on average over that belief. What is imagined changes the
-belief, and with it the worth of all plans.
+The evidence of all places is combined on a map, whose unknown parts count as floor. Plans are routes towards where the
+goal may be, and their worth is how soon they would arrive, on average over that belief. Imagined views change the
+belief, and with it the value of all plans.
 """
 
 from __future__ import annotations
@@ -60,7 +60,7 @@ class NavigatorOptions:
     trust: float = 0.7
     """Weight of an imagined place beside a real one."""
     spacing: float = 0.4
-    """Least metres between the imagined places of a plan, and between remembered ones and real ones."""
+    """Minimum metres between the imagined places of a plan, and between remembered ones and real ones."""
     patience: float = 12.0
     """Primitives after which an arrival is worth 1/e of one now."""
     commitment: float = 0.25
@@ -70,12 +70,12 @@ class NavigatorOptions:
     apart: float = 0.5
     """Metres between the ends of plans."""
     targets: int = 8
-    """Most places that routes are planned to."""
+    """Maximum number of places that routes are planned to."""
 
     def __post_init__(self) -> None:
         if min(self.patience, self.overlap) <= 0 or self.targets < 1 or min(vars(self).values()) < 0:
             raise ArgumentError(
-                f"policy navigator: expected patience and overlap above 0, targets of 1 or more and no number below 0, "
+                "policy navigator: expected patience and overlap above 0, at least 1 target and no negative number, "
                 f"got {self}"
             )
         if not (self.doubt < 1 and self.commitment <= 1):
@@ -116,13 +116,13 @@ class _Outlook:
 
 
 class Navigator(Policy):
-    """Heads for where the goal probably is, and keeps to it until something better is known.
+    """Heads for the most probable place of the goal, and sticks to it until a better one is known.
 
     It needs depth, of which its map is made. Without a world model it takes the plan that is worth most by what was
-    really seen. Front views of perspective models count as panoramas of which no more is shown.
+    really seen. Front views of perspective models count as panoramas of which only that part is shown.
 
     Args:
-        weights: a file of `wiw train navigator`; None means those that come with wiw.
+        weights: a file of `wiw train navigator`; None means those shipped with wiw.
         options: see `NavigatorOptions`.
 
     Raises:
@@ -172,7 +172,7 @@ class Navigator(Policy):
             memory, observation = situation.memory, situation.observation
             if observation.depth is None:
                 raise ArgumentError(
-                    "policy navigator makes its map of depth, and the observation has none; grant depth "
+                    "policy navigator builds its map from depth, but the observation has none; enable depth "
                     "(NavigationEnv(task, depth=True)), or use a policy without a map, such as vlm"
                 )
             pose = np.asarray(observation.odometry, np.float64)
@@ -212,7 +212,7 @@ class Navigator(Policy):
             made = [make_candidate(pose, plan.actions) for plan in plans]
             for plan, future in zip(made, futures, strict=True):
                 self._remember_imagined(memory, plan, future)
-            scores.append(self._evaluate(self._look_out(memory, pose, _get_ends(made)), made))
+            scores.append(self._evaluate(self._form_outlook(memory, pose, _get_ends(made)), made))
         return scores
 
     # -- evidence ------------------------------------------------------------------------------------------------------
@@ -236,7 +236,9 @@ class Navigator(Policy):
 
     # -- plans ---------------------------------------------------------------------------------------------------------
 
-    def _look_out(self, memory: Memory, pose: NDArray[np.float64], included: NDArray[np.float64] = NOWHERE) -> _Outlook:
+    def _form_outlook(
+        self, memory: Memory, pose: NDArray[np.float64], included: NDArray[np.float64] = NOWHERE
+    ) -> _Outlook:
         """Return the belief by all evidence, and where it leads the agent, which it remembers.
 
         The map covers what is within 9 m of the start, and all evidence, the target and `included` [N, 2] beyond.
@@ -268,10 +270,10 @@ class Navigator(Policy):
 
     def _propose_one(self, situation: Situation, count: int, horizon: int) -> list[Proposal]:
         memory, pose = situation.memory, np.asarray(situation.observation.odometry, np.float64)
-        outlook = self._look_out(memory, pose)
+        outlook = self._form_outlook(memory, pose)
         plans = self._list_plans(memory, outlook, pose, horizon)
         if not outlook.way_map.cells.contain(_get_ends(plans)):  # a straight run leads off the map
-            outlook = self._look_out(memory, pose, pose[:2] + horizon * STEP * np.array([[-1, -1], [1, 1]]))
+            outlook = self._form_outlook(memory, pose, pose[:2] + horizon * STEP * np.array([[-1, -1], [1, 1]]))
             plans = self._list_plans(memory, outlook, pose, horizon)
         values = self._evaluate(outlook, plans)
         chosen = choose_apart(plans, values, count, self.options.apart)

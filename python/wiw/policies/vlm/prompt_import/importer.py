@@ -1,9 +1,9 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Prompts of the user's own copy of the paper: its LaTeX source, or a checkout of its published code.
+"""Import prompts from the user's own copy of the paper: its LaTeX source, or a checkout of its published code.
 
-Neither wording is part of this project. What is known here is where each prompt stands and which slots it has. Slots
-are mapped to this project's; what a source does not have (how an answer is to be written, which this project reads in
-its own form) is completed from the shipped set "minimal".
+Neither wording is part of this project, which only knows where each prompt is found and which slots it has. Slots are
+mapped to this project's; what a source lacks (such as the format of answers, which this project reads in its own form)
+is taken from the built-in set "minimal".
 """
 
 from __future__ import annotations
@@ -16,12 +16,13 @@ from wiw.errors import PromptError
 from wiw.files import atomic_folder
 from wiw.policies.vlm.prompt_import.slots import convert_slots
 from wiw.policies.vlm.prompt_import.sources import FoundPrompt, read_source
-from wiw.policies.vlm.prompts import FOLDER, SETS, Prompts, get_slots
+from wiw.policies.vlm.prompts.templates import FOLDER, SETS, Prompts, get_slots
 
 CARD = "prompts.yaml"
-"""Says in a prompt folder where each template came from."""
+"""File in a prompt folder that says where each template came from."""
 FROM_DEFAULT = ("manipulation/examples",)
-"""Templates that the set "default" completes: the paper's robot is shown examples, which the set "minimal" lacks."""
+"""Templates that are taken from the set "default": the paper's robot is shown examples, which the set "minimal"
+lacks."""
 
 
 @dataclass(frozen=True)
@@ -32,11 +33,11 @@ class ImportedPrompts:
     digest: str
     """Digest of all templates, as runs record it."""
     imported: Mapping[str, str]
-    """Where in the source each template was found, by its name."""
+    """Place in the source of each template, by its name."""
     completed: Mapping[str, str] = field(default_factory=dict)
-    """Which shipped set each of the other templates is from."""
+    """Which built-in set each of the other templates is from."""
     unused: tuple[str, ...] = ()
-    """Prompts of the source that no task here asks with."""
+    """Prompts of the source that no task here uses."""
 
 
 def import_prompts(source: str | Path, out: str | Path) -> ImportedPrompts:
@@ -44,12 +45,12 @@ def import_prompts(source: str | Path, out: str | Path) -> ImportedPrompts:
 
     Args:
         source: the paper's LaTeX source, a file or a folder; or a checkout of its published code.
-        out: folder to write, which must not exist or be empty.
+        out: folder to write, which must be new or empty.
 
     Raises:
         PromptError: no prompts in the source, or one that cannot be read, lacks a slot, has an unknown one, or does not
             render; names file and line.
-        FileError: `out` has content, or cannot be written.
+        FileError: `out` is not empty, or cannot be written.
     """
     target = Path(out).expanduser()
     found, unused = read_source(Path(source).expanduser())

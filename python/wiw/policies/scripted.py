@@ -35,7 +35,7 @@ PURPOSE = 0x73637269
 
 
 class Scripted(Policy):
-    """Plans with errors, and scores plans by what their ends show.
+    """Proposes expert plans, some with deliberate mistakes, and scores plans by what their last frames show.
 
     The error rates are fixed so that the first plan alone succeeds in 40 to 50 of 100 episodes of the four manipulation
     tasks (`docs/results.md`): choosing can win as much as it can lose.

@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """Real scans: scenes whose labels lie in files of their own, in the layout of a dataset.
 
-A scan is opened by its mesh file, as any scene is; `find_reader` tells by the files beside it whose layout it has.
+A scan is opened by its mesh file, as any scene is; `find_reader` recognises its layout by the files beside it.
 """
 
 from __future__ import annotations
@@ -79,10 +79,10 @@ def find_scans(kind: str, folder: Path, split: str = "") -> list[Path]:
         split: a folder of that name, such as HM3D's "val"; "" for all there are.
 
     Raises:
-        FileError: there is no such folder, or it holds no scan of that kind.
+        FileError: the folder does not exist, or has no scan of that kind.
     """
     if kind not in KINDS:
-        raise ArgumentError(f"'{kind}' is no kind of scan; expected one of {', '.join(KINDS)}")
+        raise ArgumentError(f"'{kind}' is not a kind of scan; expected one of {', '.join(KINDS)}")
     find = {"mp3d": matterport.find, "hm3d": hm3d.find, "replica": replica.find}.get(kind, scene_dataset.find)
     return find(folder, split)
 
@@ -91,7 +91,7 @@ def find_all(folder: Path) -> list[Path]:
     """Return the scans of every kind in a folder, in order.
 
     Raises:
-        FileError: there is no such folder, or it holds none.
+        FileError: the folder does not exist, or has none.
     """
     found: set[Path] = set()
     for kind in ("mp3d", "hm3d", "replica", "hssd"):

@@ -20,7 +20,7 @@ from wiw.errors import ArgumentError, DependencyError
 from wiw.perception.tracking import Track, Tracker, get_target, track_rollouts
 from wiw.policies.base import FrameSpec, Policy, Situation
 from wiw.policies.vlm import plans, presets, prompt_images
-from wiw.policies.vlm.prompts import Prompts
+from wiw.policies.vlm.prompts.templates import Prompts
 from wiw.registry import TRACKERS
 from wiw.types import Answer, Exchange, Goal, Key, Observation, Proposal, Rollout, TextAnswer
 from wiw.vlm import Reply, Request, connect, user
@@ -40,7 +40,7 @@ FALLBACK_SEED, _ANSWER_SEED, _MOVE_SEED, REVISION_SEED = 0x64726177, 0x616E7377,
 """Separate the seeds of a decision's questions."""
 FALLBACK_NOTE = "drawn: no answer could be used"
 MAX_PLAN_TOKENS = 1024
-"""Most tokens of a plan."""
+"""Maximum number of tokens of a plan."""
 ROLES = ("propose", "revise", "answer")
 """Sorts of questions that may go to different models."""
 MOVES = list(plans.PRIMITIVES.values())
@@ -51,7 +51,7 @@ class Memory:
     """The memory of one episode."""
 
     horizon: int = 1
-    """Most primitives, or poses, of a plan."""
+    """Maximum number of primitives, or poses, of a plan."""
     belief: NDArray[np.float64] | None = None
     """The last answer, as probabilities that sum to 1 ..."""
     raw_belief: NDArray[np.float64] | None = None
@@ -116,7 +116,7 @@ class VLM(Policy):
     tracks: bool = True
     """Whether there are tasks among them that point something out."""
     shows_front = True
-    """Whether it is shown the agent's front view alone, rather than views of its own."""
+    """Whether it is only shown the agent's front view, rather than its own views."""
     fallback_action = "a primitive was drawn"
     """Description of the fallback where no plan can be used."""
 
@@ -220,7 +220,7 @@ class VLM(Policy):
             ArgumentError: a task without prompts.
         """
         if goal.task not in self.tasks:
-            hint = f"; make it with task='{goal.task}'" if goal.question else ""
+            hint = f"; create it with task='{goal.task}'" if goal.question else ""
             raise ArgumentError(f"policy vlm: expected a task among {', '.join(self.tasks)}, got '{goal.task}'{hint}")
         return Memory()
 
@@ -382,7 +382,7 @@ class VLM(Policy):
     def _show_plans(
         self, proposals: Sequence[Proposal], rollouts: Sequence[Rollout], tracks: Sequence[Track | None] | None = None
     ) -> list[Part]:
-        """Return each plan in words, and then what it is imagined to lead to."""
+        """Return each plan in words, followed by its imagined outcome."""
         parts: list[Part] = []
         rows = zip(proposals, rollouts, tracks or [None] * len(proposals), strict=True)
         for number, (plan, rollout, track) in enumerate(rows, 1):
@@ -510,7 +510,7 @@ class VLM(Policy):
         if memory.tracks is None or memory.tracks[0] != name:
             if self.tracker is None:
                 raise ArgumentError(
-                    "policy vlm: recognition needs a tracker, and this policy was made with tracker=None"
+                    "policy vlm: recognition needs a tracker, but this policy was created with tracker=None"
                 )
             (tracks,) = track_rollouts(self.tracker, [situation.observation], [proposals], [rollouts])
             memory.tracks = name, tracks
@@ -566,8 +566,8 @@ def _check_roles(roles: Mapping[str, Mapping[str, Any]], model: str | None) -> M
     fits = all(role in ROLES and "model" in own and set(own) <= {"vlm", "model"} for role, own in roles.items())
     if not fits or (roles and model is None):
         raise ArgumentError(
-            f"policy vlm: expected roles among {', '.join(ROLES)}, each with a model and perhaps another vlm, and the "
-            f"name of the model of all others (model=, --vlm-model), got roles={roles}, model={model}"
+            f"policy vlm: expected roles among {', '.join(ROLES)}, each with a model and optionally its own vlm, and "
+            f"the model's name for all others (model=, --vlm-model), got roles={roles}, model={model}"
         )
     return roles
 

@@ -15,7 +15,8 @@ from wiw.errors import ArgumentError
 from wiw.mapping.views import HFOV_DEG, VIEW_NAMES, cut_views
 from wiw.perception.scene_labels import Labeller, SceneLabels
 from wiw.policies.base import FrameSpec, Situation
-from wiw.policies.vlm import MAX_PLAN_TOKENS, REVISION_SEED, VLM, Memory, derive_seed, plans
+from wiw.policies.vlm import plans
+from wiw.policies.vlm.policy import MAX_PLAN_TOKENS, REVISION_SEED, VLM, Memory, derive_seed
 from wiw.policies.vlm.questions import commands, prompt_images, steering
 from wiw.policies.vlm.questions.commands import Command
 from wiw.policies.vlm.questions.home_map import HomeMap, Sight
@@ -45,7 +46,7 @@ class QuestionMemory(Memory):
     commands: dict[bytes, Command] = field(default_factory=dict)
     """Commands of the present decision by the plans that they became."""
     answer: tuple[Key, str] | None = None
-    """The planner's latest answer, empty where it gave none, and at which decision."""
+    """The planner's latest answer, empty if it gave none, and at which decision."""
     executed: int = 0
     """Primitives that had been executed at the latest observation."""
     history: list[str] = field(default_factory=list)
@@ -58,13 +59,13 @@ class QuestionVLM(VLM):
     At each decision the *high-level planner* sees the question and four real views, with landmarks marked and without.
     It commands to go to a landmark or in the direction of a view, and answers if it can. The *low-level planner* makes
     primitives of commands: a route to a landmark over floor that depth has shown; for words, a walk that the model
-    writes. With a world model each of M commands is imagined, and a question with the views at their ends asks for the
-    command to follow. Answers come from the planner, who is shown real views alone.
+    writes. With a world model each of M commands is imagined, and a question with the views at their ends selects the
+    command to follow. Answers come from the planner, who is only shown real views.
 
     Args:
         args, options: as of `VLM`.
         perception: finds the landmarks: "learned", "detector" (a detector and a segmenter), or a `Labeller`.
-        history: the planner is told its latest commands, so many of them; 0: it has no memory of them.
+        history: number of its latest commands that the planner is told; 0: it has no memory of them.
         order: which picture of the real views comes first, "marked_first" or "plain_first".
 
     Raises:
@@ -93,8 +94,8 @@ class QuestionVLM(VLM):
         self.labeller: Labeller = LABELLERS.make(perception)
         if "ids" in self.labeller.needs:
             raise ArgumentError(
-                f"policy vlm: {type(self.labeller).__name__} reads the simulator's instance ids, which no agent is "
-                "given; expected perception that sees images alone, such as learned"
+                f"policy vlm: {type(self.labeller).__name__} needs the simulator's instance ids, which agents never "
+                "see; expected perception that uses only images, such as learned"
             )
         self.history, self.order = history, order
         self.needs = ("depth",)
@@ -267,7 +268,7 @@ class QuestionVLM(VLM):
     def revise(
         self, situation: Situation, proposals: Sequence[Proposal], scores: NDArray[np.float64]
     ) -> tuple[NDArray[Any], int | None]:
-        """Return the decided plan, and remember its command for the prompts to come."""
+        """Return the decided plan, and remember its command for later prompts."""
         actions, chosen = super().revise(situation, proposals, scores)
         memory: QuestionMemory = situation.memory
         command = memory.commands.get(actions.tobytes())
@@ -321,7 +322,7 @@ class QuestionVLM(VLM):
 
 
 def _get_answer(situation: Situation) -> str | None:
-    """Return the answer of this decision's planner, empty where it has none; None where it was not asked."""
+    """Return the answer of this decision's planner, empty if it has none; None if it was not asked."""
     latest = situation.memory.answer
     return None if latest is None or latest[0] != situation.key else latest[1]
 

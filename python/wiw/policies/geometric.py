@@ -14,8 +14,9 @@ from numpy.typing import NDArray
 
 from wiw import panorama
 from wiw.policies.base import Situation
-from wiw.policies.matcher import HEADINGS, Matcher, Memory, appearance
+from wiw.policies.matcher import appearance
 from wiw.policies.matcher.exploration import CELL, FAR_DISTANCE, HALF, compute_distance_field, to_cells
+from wiw.policies.matcher.policy import HEADINGS, Matcher, Memory
 from wiw.types import Goal, Key, Observation
 
 VIEW = 320
@@ -24,7 +25,7 @@ YAWS_DEG = (0.0, 90.0, 180.0, 270.0)
 RATIO = 0.8
 """Lowe's ratio test."""
 INLIERS = 14
-"""Least number of inliers for a pose to be accepted."""
+"""Minimum number of inliers for a pose to be accepted."""
 REACH = 8.0
 """Metres beyond which a solved pose is rejected."""
 PULL = 3.0
@@ -43,9 +44,9 @@ class GeometricMemory(Memory):
 
 
 class Geometric(Matcher):
-    """The matcher, attracted to the goal camera's position by SIFT matches, true depth and PnP with RANSAC.
+    """The matcher, attracted to the goal camera's position, which SIFT matches, true depth and PnP with RANSAC give.
 
-    A classical baseline beside learned imagination: it needs depth and texture, but no imagination.
+    A classical baseline for comparison with learned imagination: it needs depth and texture, but no imagination.
     """
 
     def begin(self, goal: Goal, key: Key) -> GeometricMemory:
@@ -145,7 +146,7 @@ def _solve_pose(
 def _unproject_pixel(
     pixel: NDArray[np.float32], yaw_deg: float, depth: NDArray[np.float32]
 ) -> NDArray[np.float64] | None:
-    """Return the 3D point at a view's pixel, in the frame of the front camera; None where nothing was hit."""
+    """Return the 3D point at a view's pixel, in the frame of the front camera; None if nothing was hit."""
     x, y = (pixel[0] + 0.5) / (VIEW / 2) - 1, (pixel[1] + 0.5) / (VIEW / 2) - 1
     yaw = np.radians(yaw_deg)
     ray = np.array([x * np.cos(yaw) - np.sin(yaw), y, x * np.sin(yaw) + np.cos(yaw)])

@@ -38,7 +38,7 @@ SURFACES = ("floor", "wall")
 SURFACE_STRIDE = 24
 """Pixels between the looks at floors and walls, along rows and columns."""
 LOOK_ACTIONS = 3
-"""Most primitives of a plan that only takes a second look."""
+"""Maximum number of primitives of a plan that only takes a second look."""
 MOST_GAIN = 12.0
 """Square metres of new floor that count at most: one room. More would draw an agent to and fro across a home."""
 LAST_ACTIONS = 18
@@ -58,7 +58,7 @@ class Explorer(Policy):
         imagination: weight of what imagined views show, in the units of a destination's worth (square metres).
         path: worth of a metre that need not be walked, in square metres of new floor.
         affinity: worth of a room that is likely to have what is asked about.
-        budget: primitives of an episode; with its last segment the agent answers, however sure it is.
+        budget: primitives of an episode; with its last segment the agent answers, whatever its confidence.
 
     Raises:
         ArgumentError: a labeller that needs the simulator's instance ids.
@@ -82,7 +82,7 @@ class Explorer(Policy):
         self.labeller: Labeller = LABELLERS.make(perception)
         if "ids" in self.labeller.needs:
             raise ArgumentError(
-                f"explorer: {type(self.labeller).__name__} knows the simulator's instances, which no agent is given; "
+                f"explorer: {type(self.labeller).__name__} needs the simulator's instance ids, which agents never see; "
                 "policy explorer-oracle is an explorer with true perception"
             )
         self.sure, self.imagination, self.path, self.affinity, self.budget = sure, imagination, path, affinity, budget
@@ -98,7 +98,7 @@ class Explorer(Policy):
         """
         if task.get("judge") is None:
             raise ArgumentError(
-                f"policy explorer answers questions about a home, and task '{task.get('task', 'of this run')}' asks "
+                f"policy explorer answers questions about a home, but task '{task.get('task', 'of this run')}' asks "
                 "none; use it with task aeqa (`wiw run aeqa`)"
             )
 
@@ -156,7 +156,7 @@ class Explorer(Policy):
         return looks
 
     def _mark_refused(self, situation: Situation) -> None:
-        """Mark what stood in the way since the last decision, and note where the agent stands now."""
+        """Mark the obstacles met since the last decision, and note where the agent is now."""
         memory = situation.memory
         pose = turn_odometry(situation.observation.odometry, memory.azimuth)
         if memory.executed < len(situation.executed):
@@ -196,7 +196,7 @@ class Explorer(Policy):
     # -- plans ---------------------------------------------------------------------------------------------------------
 
     def propose(self, situations: Sequence[Situation], candidates: int, horizon: int) -> list[list[Proposal]]:
-        """Return routes to different places, the one most worth going to first; a short second look after an answer."""
+        """Return routes to different places, the most valuable one first; a short second look after an answer."""
         return [self._plan(situation, candidates, horizon) for situation in situations]
 
     def _plan(self, situation: Situation, candidates: int, horizon: int) -> list[Proposal]:
@@ -279,7 +279,7 @@ class Explorer(Policy):
         ]
 
     def draw(self, situation: Situation, decision: Decision, north: float) -> dict[str, NDArray[np.uint8]]:
-        """Return the map of real views, and the present view with what it is believed to show."""
+        """Return the map of real views, and the present view with the things believed to be in it."""
         return draw_beliefs(situation.memory, situation, decision, north)
 
     def is_final(self, situation: Situation) -> bool:

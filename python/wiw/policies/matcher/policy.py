@@ -54,7 +54,7 @@ class MatcherOptions:
     """Similarity at which the goal is near with probability one half."""
     gate_width: float = 0.15
     spread: int = 3
-    """Least difference between headings of imagined plans, in turns, when the goal is near."""
+    """Minimum difference between headings of imagined plans, in turns, when the goal is near."""
     reach: float = 1.0
     """Metres ahead at which a heading is evaluated."""
 
@@ -85,7 +85,7 @@ class Memory:
 
 
 class Matcher(Policy):
-    """Explores where nothing matches, and climbs the similarity to the goal image where something does.
+    """Explores while nothing matches the goal image, and climbs the similarity to it once something does.
 
     Without a world model it takes the best of all 16 headings by what it really sees; with one, the best plans are
     imagined, and the similarity of the imagined places decides between them.
@@ -263,7 +263,7 @@ def recall_gains(memory: Memory, odometry: NDArray[np.float64], runs: NDArray[np
 def measure_imagined_gain(
     memory: Memory, odometry: NDArray[np.float64], plan: Proposal, rollout: Rollout
 ) -> float | None:
-    """Return the gain in similarity at the plan's best imagined place; None where no new place was imagined.
+    """Return the gain in similarity at the plan's best imagined place; None if no new place was imagined.
 
     Panoramas are compared over all headings; the front views of a perspective model only with what is seen now in the
     direction in which the plan ends. The places are remembered.

@@ -2,7 +2,7 @@
 """Prompt templates: one folder per task, one Jinja file per question, with the paper's slots.
 
 There are sets of them. `default` lies here; `minimal`, in a folder of its own, has slots and schemas and gives no
-advice. A user's own folder may replace either (`wiw.policies.vlm.prompt_import` makes one of a copy of the paper).
+advice. A user's own folder may replace either (`wiw prompts import` makes one of a copy of the paper).
 
 Slots of all tasks: `look_ahead_action_num` (actions of a plan) and `plan_num` (number of plans requested). Navigation
 and recognition: `obs_key` (the observation in words) and `actions` (name to meaning). Manipulation: `position_bins`,
@@ -79,7 +79,7 @@ def list_tasks() -> list[str]:
 
 
 class Prompts:
-    """Templates of all tasks: a user's where there are any, else those shipped with the package.
+    """Templates of all tasks: a user's if there are any, else those shipped with the package.
 
     Args:
         source: name of a shipped set (`SETS`), or a folder with templates as `<task>/<name>.j2`, named like the shipped
@@ -115,7 +115,7 @@ class Prompts:
         """
         place = f"{task}/{name}.j2"
         if place not in self._templates:
-            raise ArgumentError(f"policy vlm: no prompt '{name}' for task '{task}'; there are some for {list_tasks()}")
+            raise ArgumentError(f"policy vlm: no prompt '{name}' for task '{task}'; it exists for {list_tasks()}")
         path, source = self._templates[place]
         own = place in self._own
         text = self._filling.fill(path, source, slots) if own else template_worker.fill_template(source, slots)
@@ -136,7 +136,9 @@ class Prompts:
             )
         for name, (path, source) in own.items():
             if name not in self._templates:
-                raise PromptError(f"{path}: no prompt has this name; there are {', '.join(sorted(self._templates))}")
+                raise PromptError(
+                    f"{path}: no prompt has this name; expected one of {', '.join(sorted(self._templates))}"
+                )
             # tried on, so that what is wrong is known before the first question
             self._filling.fill(path, source, get_slots(path.parent.name), check=True)
         return own

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Errors of known doses, done to imagined futures to learn which kind of error costs success.
+"""Errors of known doses, added to imagined futures to learn which kinds of error cost success.
 
 `error-blur@16` is an arm whose world model is the oracle with frames blurred by 16 pixels, `error-blur@16:warp` one of
 another world model. `wiw list errors` has all kinds with the units of their doses; `wiw study errors` runs them all.

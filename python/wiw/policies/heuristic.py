@@ -16,7 +16,7 @@ INVERSE: dict[int, int] = {TURN_LEFT: TURN_RIGHT, TURN_RIGHT: TURN_LEFT}
 
 
 class Heuristic(Policy):
-    """Samples primitives that never undo the previous one and never turn the same way more than four times running.
+    """Samples primitives that never undo the previous one and never turn the same way more than four times in a row.
 
     Source: paper, appendix "Policies in Embodied Tasks". It proposes only; `matcher` is its default reviser.
     """

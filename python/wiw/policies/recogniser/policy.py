@@ -43,7 +43,7 @@ class Memory:
 
 
 class Recognition(Policy):
-    """Answers with the recogniser's distribution over the stored real glimpses and this decision's imagined ones.
+    """Answers with the recogniser's distribution, given the stored real glimpses and this decision's imagined ones.
 
     It proposes to approach the target, or to step aside where something hides it, and scores a plan by the confidence
     of the answer with the plan's imagined glimpses. Frames that lose the target count against a plan.
@@ -75,9 +75,8 @@ class Recognition(Policy):
         """
         if not task.get("categories"):
             raise ArgumentError(
-                "policy recogniser names the object that a task marks, and task "
-                f"'{task.get('task', 'of this run')}' marks none; use it with task ar (`wiw run ar`), and for imagenav "
-                "a policy such as matcher"
+                f"policy recogniser names the object that a task marks, but task '{task.get('task', 'of this run')}' "
+                "marks none; use it with task ar (`wiw run ar`), and for imagenav a policy such as matcher"
             )
 
     def __init__(
@@ -128,7 +127,7 @@ class Recognition(Policy):
             memory.looks = [*others, (here, found)][-self.remember :]
 
     def propose(self, situations: Sequence[Situation], candidates: int, horizon: int) -> list[list[Proposal]]:
-        """Return different ways to a better view, the most promising first."""
+        """Return different paths to a better view, the most promising first."""
         return [self._build_plans(situation, candidates, horizon) for situation in situations]
 
     def _build_plans(self, situation: Situation, candidates: int, horizon: int) -> list[Proposal]:
