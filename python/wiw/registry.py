@@ -278,7 +278,7 @@ POLICIES = Registry(
         "recogniser": "wiw.policies.recogniser.policy:Recognition",
         "vlm": "wiw.policies.vlm.make:make_vlm",
         "scripted": "wiw.policies.scripted:Scripted",
-        "diffuser": "wiw.policies.diffuser:Diffuser",
+        "diffuser": "wiw.policies.diffuser.policy:Diffuser",
         "explorer": "wiw.policies.explorer.policy:Explorer",
         "explorer-oracle": "wiw.experiments.privileged_explorers:OracleExplorer",
         "explorer-tour": "wiw.experiments.privileged_explorers:TourExplorer",

@@ -205,7 +205,7 @@ PATHS, STEPS = 16, 20
 
 
 def _make_diffuser() -> nn.Module:
-    from wiw.policies.diffuser import BUILT_IN
+    from wiw.policies.diffuser.policy import BUILT_IN
     from wiw.policies.diffuser.weights import load
 
     return load(BUILT_IN)[0]
