@@ -10,6 +10,10 @@ from pathlib import Path
 
 import cv2
 from glb import Glb
+from locations import ROOM_FOLDERS
+
+sys.path.extend(ROOM_FOLDERS)
+
 from test_damaged_files import DAE, OBJ, PLY, SDF, binary_ply, posed_glb, textured_glb
 from test_gltf import (
     DRACO,

@@ -23,6 +23,10 @@ from typing import Any
 HERE = Path(__file__).parent
 sys.path[:0] = [str(HERE.parent), str(HERE.parent / "python")]
 
+from locations import ROOM_FOLDERS  # noqa: E402
+
+sys.path.extend(ROOM_FOLDERS)
+
 from test_crash import whole  # noqa: E402
 from test_shards import read_rows  # noqa: E402
 

@@ -20,6 +20,10 @@ import atheris
 HERE = Path(__file__).parent
 sys.path[:0] = [str(HERE.parent), str(HERE.parent / "python")]
 
+from locations import ROOM_FOLDERS  # noqa: E402
+
+sys.path.extend(ROOM_FOLDERS)
+
 from readers import READERS, STRUCTURES  # noqa: E402
 
 

@@ -19,6 +19,10 @@ import numpy as np
 TESTS = Path(__file__).parents[1]
 sys.path[:0] = [str(TESTS), str(TESTS / "python")]
 
+from locations import ROOM_FOLDERS  # noqa: E402
+
+sys.path.extend(ROOM_FOLDERS)
+
 from fuzz_files import DATA, write_all  # noqa: E402
 from readers import READERS, make_stl  # noqa: E402
 from test_damaged_files import DAE, MTL, OBJ, OWN, PLY, SQUARE, URDF, binary_ply  # noqa: E402

@@ -2,7 +2,7 @@
 """The conditional diffusion transformer of Navigation World Models (Bar et al., CVPR 2025, section 3.2).
 
 Written from the paper's description. Parameters have the names and shapes of the published checkpoints, so those load
-strictly: `tests/python/test_nwm.py` has them spelt out.
+strictly: `tests/python/world_models/test_nwm.py` has them spelt out.
 """
 
 from __future__ import annotations

@@ -1,0 +1,156 @@
+# SPDX-License-Identifier: Apache-2.0
+"""What a newcomer's command says: what will run, what there is, and what is wrong."""
+
+from __future__ import annotations
+
+import pickle
+import re
+import socket
+from pathlib import Path
+from types import SimpleNamespace
+
+import pytest
+from locations import PYTHON_TESTS, ROOT
+
+from wiw import errors
+from wiw.cli import main
+from wiw.cli.demo import PARTS
+from wiw.errors import VlmError
+from wiw.registry import TASKS
+from wiw.vlm.openai import OpenAIClient
+
+FAKES = PYTHON_TESTS / "fakes.py"
+
+
+def test_a_run_announces_itself_before_it_does_anything(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def refuse(*_: object, **__: object) -> None:
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr("wiw.studies.evaluate.evaluate", refuse)
+    options = ["--scenes", "apartments:val:4", "--episodes", "8", "--arms", "copy,oracle", "--workers", "2"]
+    assert main(["run", "imagenav", *options, "--out", str(tmp_path / "r")]) == 130
+    assert capsys.readouterr().err.splitlines()[:4] == [
+        "task    imagenav: 8 episodes in 2 of 4 scenes (apartments:val:4, 5 per scene), seed 0",
+        "arms    copy, oracle (policy matcher)",
+        "workers 2",
+        f"run     {tmp_path / 'r'}",
+    ]
+
+
+@pytest.mark.parametrize(
+    ("what", "names", "others"),
+    [
+        ("tasks", ["imagenav", "ar", "manipulation"], ["warp"]),
+        ("policies", ["matcher", "vlm"], ["warp", "imagenav"]),
+        ("trackers", ["reprojection", "sam2"], ["matcher"]),
+        ("metrics", ["spl", "mean_trajectory"], ["matcher"]),
+        ("presets", ["official", "paper-diffusion"], ["matcher"]),
+    ],
+)
+def test_list_takes_a_kind(what: str, names: list[str], others: list[str], capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(["list", what]) == 0
+    first_words = set(re.findall(r"^  (\S+)", capsys.readouterr().out, re.MULTILINE))
+    assert set(names) <= first_words and not set(others) & first_words
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        (["--policy-option", "a=b"], "policy matcher: unknown option 'a'; expected one of histogram,"),
+        (["--policy-option", "turn=left"], "policy matcher: turn: expected a number, got 'left'"),
+        (["--width", "2"], "give --depth 2 or more"),
+        (["--fidelity-share", "0.5"], "give --fidelity"),
+        (["--served", "warp"], "give their number with --servers"),
+        (["--cache", "off", "--cache-gb", "3"], "leave one of them out"),
+        (["--look-every", "5"], "give --until"),
+        (["--policy", "recogniser"], "use it with task ar"),
+        (["--scenes", "apartment:val:1"], "wiw: apartment:val:1: no such file"),
+        (["--scenes", "apartment:val:1"], "Did you mean apartments:val:1?"),
+        (["--policy", "matcher", "--revision", "recogniser"], "use it with task ar"),
+        (["--world-model", f"{FAKES}:Nothing"], "fakes.py defines no 'Nothing'; it has LineEnv,"),
+    ],
+)
+def test_a_mistake_is_explained_in_one_line(
+    arguments: list[str], message: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    options = ["--scenes", "apartments:val:1", "--episodes", "1", "--out", str(tmp_path / "r"), "--no-report"]
+    assert main(["run", "imagenav", *options, *arguments]) == 2
+    last = capsys.readouterr().err.splitlines()[-1]
+    assert last.startswith("wiw: ") and message in last
+
+
+def test_a_missing_episode_file_is_named_once(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    file = tmp_path / "none.json"
+    assert main(["run", "imagenav", "--episode-file", str(file), "--out", str(tmp_path / "r")]) == 2
+    assert capsys.readouterr().err.splitlines()[-1] == f"wiw: {file}: No such file or directory"
+
+
+def test_facts_of_scenes_are_whole_in_80_columns(
+    two_rooms: str, tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setenv("COLUMNS", "80")
+    monkeypatch.setattr(
+        "wiw.cli.scenes._list_facts", lambda _: ["a" * 40, "10.5 x 12.2 x 2.6", "1,108,123", *["1234"] * 5]
+    )
+    assert main(["scenes", two_rooms, "--views", "1", "--out", str(tmp_path / "sheet.png")]) == 0
+    shown = capsys.readouterr().out
+    assert "…" not in shown and max(map(len, shown.splitlines()[:4])) <= 80
+    for text in ("triangles", "walk m2", "islands", "1,108,123", "10.5 x 12.2 x 2.6"):
+        assert text in shown
+
+
+def test_the_demo_ends_with_its_pages_and_the_ready_report(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setenv("COLUMNS", "80")
+    log = SimpleNamespace(report=lambda remark: reports.append(remark) or "report.html")
+    reports: list[str] = []
+    monkeypatch.setattr("wiw.studies.evaluate.evaluate", lambda *_, **__: log)
+    monkeypatch.setattr("wiw.cli.run.finish", lambda log, report, remark: print(log.report(remark)) or 0)
+    assert main(["demo", "--out", str(tmp_path)]) == 0
+    shown = capsys.readouterr().out
+    ready = "docs/report-imagenav.html"
+    assert (
+        ready in " ".join(shown.split()) and all(ready in remark for remark in reports) and len(reports) == len(PARTS)
+    )
+    assert {part.task for part in PARTS} == set(TASKS.names())
+    assert all(f"{tmp_path}/{part.task}/report.html" in shown for part in PARTS)
+    text = [line for line in shown.splitlines() if not line.startswith("        ")]
+    assert max(map(len, text)) < 80
+    assert ROOT.joinpath(ready).stat().st_size <= 10**6
+
+
+def test_errors_name_the_module_that_users_import() -> None:
+    for name in ("ArgumentError", "FileError", "Error", "NavigationError", "BackendError"):
+        error = getattr(errors, name)
+        assert error.__module__ == "wiw.errors"
+        assert pickle.loads(pickle.dumps(error("why"))).args == ("why",)
+
+
+def test_what_is_no_number_is_refused_plainly(capsys: pytest.CaptureFixture[str]) -> None:
+    for arguments, message in (
+        (["run", "--episodes", "two"], "--episodes: expected a whole number, got 'two'"),
+        (["run", "--episodes", "2.5"], "--episodes: expected a whole number, got '2.5'"),
+        (["run", "--deadline", "soon"], "--deadline: expected a number, got 'soon'"),
+    ):
+        with pytest.raises(SystemExit) as stop:
+            main(arguments)
+        assert stop.value.code == 2
+        shown = " ".join(capsys.readouterr().err.replace("│", " ").split())
+        assert message in shown and "no type matching" not in shown
+
+
+def test_a_sheet_that_cannot_be_written_is_an_error(two_rooms: str, capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(["scenes", two_rooms, "--views", "1", "--out", "/proc/sheet.png"]) == 2
+    assert "/proc/sheet.png: cannot be written" in capsys.readouterr().err
+
+
+def test_without_a_server_the_mock_is_suggested() -> None:
+    with socket.socket() as free:
+        free.bind(("127.0.0.1", 0))
+        port = free.getsockname()[1]
+    client = OpenAIClient(f"http://127.0.0.1:{port}/v1", attempts=1)
+    with pytest.raises(VlmError, match=r"no server answers there.*--vlm mock"):
+        _ = client.model

@@ -1,0 +1,354 @@
+# SPDX-License-Identifier: Apache-2.0
+"""World models of one's own in processes of their own: what they do there harms neither the run nor its numbers."""
+
+from __future__ import annotations
+
+import gc
+import locale
+import os
+import pickle
+import random
+import signal
+import sys
+import threading
+import time
+from contextlib import suppress
+from pathlib import Path
+
+import numpy as np
+import pytest
+from bad_models import FAILING, FATAL, HARMLESS, SIZE, WAYS, imagine
+from locations import PYTHON_TESTS
+
+import wiw
+from wiw.action import FORWARD
+from wiw.errors import ArgumentError, ConstructionError, ContractError, RegistryError, RolloutError
+from wiw.isolation.failures import EndedError, ExitError, LateError, RaisedError
+from wiw.isolation.models import IsolatedModel
+from wiw.loop import attempts
+from wiw.loop.attempts import Attempted, make_model
+from wiw.policies.base import Situation
+from wiw.runs.recipes import AgentRecipe, TaskRecipe
+from wiw.studies.evaluate import evaluate
+from wiw.types import Conditioning, Control, Decision, Goal, Key, Observation
+
+BAD = f"{PYTHON_TESTS / 'bad_models.py'}:Bad"
+PEEPING = BAD.replace(":Bad", ":Peeping")
+CONTROLS = [Control(np.full(2, FORWARD, np.int8), np.zeros((2, 3)), np.stack([np.eye(4)] * 2), length=2)] * 2
+FAILURES = (EndedError, ExitError, LateError, RaisedError, ContractError)
+
+
+@pytest.fixture(autouse=True)
+def at_once(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(attempts, "PAUSES", (0.0, 0.0))
+
+
+@pytest.fixture(scope="module")
+def model():
+    made = make_model(BAD, 60.0, memory_gb=0.3)
+    yield made
+    made.close()
+
+
+def observe(way=None):
+    """Return observations that make the model misbehave in some way."""
+    image = np.full((2, *SIZE, 3), 90, np.uint8)
+    image[0, 0, 0, 0] = 0 if way is None else 1 + WAYS.index(way)
+    return Conditioning(image)
+
+
+def ask(model, way=None, deadline=20.0):
+    seeds = np.arange(2, dtype=np.uint64)
+    return Attempted(model, deadline).once(observe(way), CONTROLS, seeds)
+
+
+def describe_surroundings():
+    """Return what of this process a careless model changes."""
+    return {
+        "random": (random.getstate(), np.random.get_state()[1].tolist()),  # noqa: NPY002 - what models change
+        "folder": os.getcwd(),  # noqa: PTH109 - as the system has it
+        "environment": dict(os.environ),
+        "path": list(sys.path),
+        "arguments": list(sys.argv),
+        "locale": locale.setlocale(locale.LC_ALL),
+        "signals": [signal.getsignal(number) for number in (signal.SIGINT, signal.SIGTERM)],
+        "numpy": np.geterr(),
+        "streams": (sys.stdin.closed, sys.stdout.closed),
+    }
+
+
+def count_descriptors():
+    return len(list(Path("/proc/self/fd").iterdir()))
+
+
+DEAR = ("change_torch",)
+"""Ways that are tried nightly."""
+
+
+@pytest.mark.parametrize(
+    "way",
+    [pytest.param(way, marks=pytest.mark.nightly if way.__name__ in DEAR else ()) for way in WAYS],
+    ids=lambda way: way.__name__,
+)
+def test_what_a_model_does_stays_in_its_process(model, way, capfd) -> None:
+    before, threads = describe_surroundings(), threading.enumerate()
+    hangs = way.__name__.startswith(("hang", "stop"))
+    try:
+        frames = ask(model, way, 0.3 if hangs else 30.0)
+    except FAILURES as error:
+        assert way in (*FATAL, *FAILING), error
+        assert isinstance(error, LateError) == hangs
+        assert isinstance(error, EndedError | LateError) == (way in FATAL)
+    else:
+        assert way in HARMLESS
+        time.sleep(0.1 if way.__name__ == "change_answer_later" else 0)
+        np.testing.assert_array_equal(frames, imagine(observe(way), CONTROLS))
+    assert describe_surroundings() == before
+    assert not [each for each in threading.enumerate() if each not in threads]
+    good = Attempted(model, 30.0).rollout(observe(), CONTROLS, np.zeros(2, np.uint64))
+    np.testing.assert_array_equal(good, imagine(observe(), CONTROLS))
+    assert "noise" not in capfd.readouterr().out
+
+
+def test_a_call_is_made_three_times_and_then_an_error_of_the_infrastructure(model) -> None:
+    asked = Attempted(model, 30.0)
+    with pytest.raises(RolloutError, match=r"Bad gave no usable answer in 3 attempts.*exit code 0") as caught:
+        asked.rollout(observe(WAYS[[way.__name__ for way in WAYS].index("exit_at_once")]), CONTROLS, np.zeros(2, "u8"))
+    assert caught.value.kind == "ended" and asked.spent["calls"] == 3
+
+
+def test_nothing_is_left_of_a_killed_process_and_its_children() -> None:
+    before = count_descriptors()
+    model = make_model(BAD, 60.0)
+    ask(model, next(way for way in WAYS if way.__name__ == "start_process"))
+    group = model._process._process.pid
+    model.close()
+    deadline = time.monotonic() + 5
+    while _has_group(group) and time.monotonic() < deadline:
+        time.sleep(0.02)
+    assert not _has_group(group)
+    del model
+    gc.collect()
+    assert count_descriptors() <= before
+
+
+def _has_group(group):
+    with suppress(ProcessLookupError):
+        os.killpg(group, 0)
+        return any(state.split()[2] != "Z" for state in _list_states(group))
+    return False
+
+
+def _list_states(group):
+    for file in Path("/proc").glob("[0-9]*/stat"):
+        with suppress(OSError):
+            text = file.read_text()
+            rest = text.rpartition(")")[2].split()
+            if int(rest[2]) == group:
+                yield f"x x {rest[0]}"
+
+
+def test_its_process_is_fresh_and_knows_no_command(two_rooms) -> None:
+    env = wiw.make("ImageNav-v0", scenes=two_rooms)
+    env.reset()
+    found = wiw.world_model(PEEPING).describe()
+    assert found["argv"] == ["wiw"] and found["simulators"] == 0 and found["modules"] == []
+    assert "pytest" not in found["main"]
+    here = wiw.world_model(PEEPING, isolate=False)
+    assert type(here).__name__ == "Peeping" and not isinstance(here, IsolatedModel)
+    assert here.describe()["simulators"] > 0
+    env.close()
+
+
+def test_answers_are_each_ones_own_and_inputs_may_be_kept(tmp_path) -> None:
+    file = tmp_path / "keeping.py"
+    file.write_text(
+        "import numpy as np, wiw\n"
+        "class Keeping(wiw.WorldModel):\n"
+        "    accepts = wiw.accepts(control='image', view='perspective', size=(64, 128), frames=3)\n"
+        "    kept = []\n"
+        "    def rollout(self, observations, controls, seeds):\n"
+        "        self.kept.append(observations.image)\n"
+        "        return np.repeat(self.kept[0][:, None], 3, 1)\n"
+    )
+    model = wiw.world_model(f"{file}:Keeping")
+    shades = [np.full((2, 64, 128, 3), shade, np.uint8) for shade in (10, 20, 30)]
+    answers = [model.rollout(Conditioning(image), CONTROLS, np.zeros(2, np.uint64)) for image in shades]
+    assert [int(answer.min()) for answer in answers] == [10, 10, 10] == [int(answer.max()) for answer in answers]
+    assert not any(np.may_share_memory(one, other) for one in answers for other in answers if one is not other)
+
+
+def test_construction_and_import_fail_by_kind(tmp_path) -> None:
+    def write(text):
+        file = tmp_path / "made.py"
+        file.write_text(f"import os, sys, time, wiw\n{text}")
+        return f"{file}:Made"
+
+    head = "class Made(wiw.WorldModel):\n    accepts = wiw.accepts(control='image', frames=3)\n    rollout = None\n"
+    with pytest.raises(RegistryError, match="cannot be loaded: its process ended with exit code 4"):
+        make_model(write("os._exit(4)"))
+    with pytest.raises(RegistryError, match=r"cannot be loaded: ValueError: here \(made\.py, line 2\)"):
+        make_model(write("raise ValueError('here')"))
+    with pytest.raises(ConstructionError, match="cannot be made: its process ended with SIGKILL") as caught:
+        make_model(write(head + "    def __init__(self):\n        os.kill(os.getpid(), 9)\n"))
+    assert caught.value.kind == "ended"
+    with pytest.raises(ConstructionError, match=r"did not return within 0\.3 s") as caught:
+        make_model(write(head + "    def __init__(self):\n        time.sleep(99)\n"), 0.3)
+    assert caught.value.kind == "deadline"
+    name = write(head + "    def __init__(self, steps: int = 3):\n        self.steps = steps\n")
+    with pytest.raises(RegistryError, match=r"unexpected keyword argument 'stps'; it takes \(steps: 'int' = 3"):
+        make_model(name, stps=4)
+    made = make_model(name, steps=4)
+    assert made.describe() == {"name": "Made", "steps": 4}
+    assert pickle.loads(pickle.dumps(made)).describe() == made.describe()
+    with pytest.raises(ArgumentError, match="only the oracle is given"):
+        make_model(write(head.replace("frames=3", "needs=('simulator',)")))
+
+
+POLICY = """
+import os
+from collections import Counter
+
+import numpy as np
+
+import wiw
+from wiw.action import FORWARD, TURN_LEFT
+from wiw.types import Proposal
+
+
+class Own(wiw.Policy):
+    def __init__(self, fatal: int = -1) -> None:
+        self.fatal, self.looks = fatal, 0
+
+    def begin(self, goal, key):
+        return Counter()
+
+    def observe(self, situations):
+        self.looks += len(situations)
+        for each in situations:
+            each.memory["looks"] += 1
+
+    def propose(self, situations, candidates, horizon):
+        if any(each.key.episode == self.fatal for each in situations):
+            os._exit(3)
+        return [[self._plan(each, number) for number in range(candidates)] for each in situations]
+
+    def _plan(self, situation, number):
+        draws = np.random.default_rng([situation.key.episode, situation.key.decision, number]).random(3)
+        actions = np.where(draws < 0.8, FORWARD, TURN_LEFT)
+        return Proposal(actions, float(draws[0]), f"look {situation.memory['looks']}, {len(situation.executed)} done")
+
+    def score(self, situations, proposals, rollouts):
+        return [np.array([plan.prior for plan in plans]) for plans in proposals]
+
+    def describe(self):
+        return {"policy": "Own"}
+
+    @property
+    def spent(self):
+        return {"looks": self.looks}
+"""
+
+
+def test_a_policy_decides_in_its_process_as_in_ours_and_cannot_take_the_run_with_it(tmp_path) -> None:
+    (tmp_path / "own.py").write_text(POLICY)
+    name, task = f"{tmp_path / 'own.py'}:Own", TaskRecipe(f"{PYTHON_TESTS / 'fakes.py'}:line_task")
+
+    def run(policy, **options):
+        recipe = AgentRecipe(policy, policy_options={policy: options})
+        return evaluate(task, recipe, 4, out=tmp_path / f"run{len(list(tmp_path.iterdir()))}", progress=False, live=2)
+
+    def read(log):
+        said = ("actions", "proposals", "scores", "chosen", "note")
+        return [{name: row[name] for name in said if name in row} for row in log.store.decisions()]
+
+    here, there = run(name), run(f"isolated:{name}")
+    assert read(here) == read(there) and len(read(here)) > 8
+    assert [row["metrics"] for row in here.episodes] == [row["metrics"] for row in there.episodes]
+    assert there.store.config["arms"][0]["agent"]["policy"] == f"isolated:{name}"  # so says the manifest
+    assert wiw.verify(there.path, 4).same
+    log = run(f"isolated:{name}", fatal=2)
+    assert [(row["episode"], row["status"]) for row in log.episodes if row["status"] != "done"] == [(2, "error")]
+    assert "its process ended with exit code 3" in log.episodes[2]["error"]
+    with pytest.raises(RegistryError, match="expected a policy of your own"):
+        wiw.policy("isolated:matcher")
+
+
+def test_a_policy_s_new_process_takes_no_memory_for_one_of_the_old_one_s(tmp_path) -> None:
+    (tmp_path / "own.py").write_text(POLICY)
+    policy, key, goal = wiw.policy(f"isolated:{tmp_path / 'own.py'}:Own"), Key(0, 0), Goal("imagenav")
+
+    def look(memory) -> str:
+        blank = np.zeros((8, 16, 3), np.uint8)
+        situation = Situation(Observation(blank, blank, np.zeros(3)), goal, key, memory)
+        policy.observe([situation])
+        return policy.propose([situation], 1, 3)[0][0].note
+
+    first, second = policy.begin(goal, key), policy.begin(goal, key)
+    assert [look(first), look(first), look(second)] == ["look 1, 0 done", "look 2, 0 done", "look 1, 0 done"]
+    policy.close()
+    new = policy.begin(goal, key)
+    with pytest.raises(RaisedError, match="process has ended, and its memory"):
+        look(second)
+    del first, second
+    gc.collect()
+    assert [look(new), look(new)] == ["look 1, 0 done", "look 2, 0 done"]
+    assert policy.spent == {"looks": 5}
+    policy.close()
+
+
+def test_a_policy_in_its_process_is_not_told_where_north_is(tmp_path) -> None:
+    drawing = """
+    def draw(self, situation, decision, north):
+        return {"north": np.full((2, 2, 3), 255 if north else 7, np.uint8)}
+"""
+    (tmp_path / "own.py").write_text(POLICY + drawing)
+    blank, key, goal = np.zeros((8, 16, 3), np.uint8), Key(0, 0), Goal("imagenav")
+    for name, shown in (("", 255), ("isolated:", 7)):
+        policy = wiw.policy(f"{name}{tmp_path / 'own.py'}:Own")
+        situation = Situation(Observation(blank, blank, np.zeros(3)), goal, key, policy.begin(goal, key))
+        decision = Decision(np.zeros(1, np.int8), 1, ())
+        assert policy.draw(situation, decision, 0.75)["north"].max() == shown
+    policy.close()
+
+
+FATAL_MODEL = """
+import os
+
+import numpy as np
+
+import wiw
+from wiw._core import core
+
+
+class Fatal(wiw.WorldModel):
+    accepts = wiw.accepts(control="image", view="perspective", size=(8, 16))
+
+    def __init__(self, fatal: int = -1) -> None:
+        self.fatal = fatal
+
+    def rollout(self, observations, controls, seeds):
+        own = [core.fold_key([0, self.fatal, d, c]) for d in range(9) for c in range(3)] if self.fatal >= 0 else []
+        if set(own) & set(map(int, seeds)):
+            os._exit(3)
+        return np.repeat(observations.image[:, None], 1 + len(controls[0].actions), 1)
+"""
+
+
+def test_an_episode_that_ends_its_model_s_process_three_times_is_an_error_and_the_run_goes_on(tmp_path) -> None:
+    (tmp_path / "own.py").write_text(POLICY)
+    (tmp_path / "fatal.py").write_text(FATAL_MODEL)
+    task = TaskRecipe(f"{PYTHON_TESTS / 'fakes.py'}:line_task")
+
+    def run(name, **options):
+        recipe = AgentRecipe(f"{tmp_path / 'own.py'}:Own", f"{tmp_path / 'fatal.py'}:Fatal", model_options=options)
+        log = evaluate(task, recipe, 3, out=tmp_path / name, progress=False, live=2)
+        return log, {row["episode"]: row["metrics"] for row in log.episodes if row["status"] == "done"}
+
+    here, quiet = run("here", isolate=False)
+    there, disturbed = run("there", fatal=1)
+    (error,) = [row for row in there.episodes if row["status"] == "error"]
+    assert (error["episode"], error["kind"]) == (1, "world_model/ended")
+    assert "in 3 attempts; the last error: its process ended with exit code 3" in error["error"]
+    assert disturbed == {episode: quiet[episode] for episode in (0, 2)} and there.complete
+    assert here.store.config["arms"][0]["agent"]["model_options"] == {"isolate": False}

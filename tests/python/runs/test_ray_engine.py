@@ -1,0 +1,207 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Runs in Ray actors are the same as in this process, whichever actors are lost."""
+
+from __future__ import annotations
+
+import os
+import signal
+import subprocess
+import sys
+import time
+from collections import deque
+from contextlib import suppress
+from types import SimpleNamespace
+
+import pytest
+from fakes import LineAgent, LineTask
+from locations import PYTHON_TESTS
+from run_facts import list_facts
+
+from wiw.cli import main
+from wiw.errors import ArgumentError, ContractError, DependencyError, InfrastructureError, StoreError
+from wiw.runs import ray_engine
+from wiw.runs.config import EngineConfig, RunConfig
+from wiw.runs.execute import _group_by_scene
+from wiw.runs.recipes import AgentRecipe, TaskRecipe
+from wiw.runs.rows import OutcomeRow
+from wiw.runs.workers import Job, WorkerSpec
+from wiw.studies.evaluate import evaluate, resume_run, run_arms
+from wiw.studies.run_log import load_run
+from wiw.types import EpisodeResult
+
+TASK = f"{PYTHON_TESTS / 'fakes.py'}:line_task"
+
+
+@pytest.fixture(scope="module")
+def reference(tmp_path_factory):
+    out = tmp_path_factory.mktemp("reference") / "run"
+    run_arms(LineTask(), {"none": LineAgent(0.5), "warp": LineAgent(0.8)}, 10, out=out, progress=False).close()
+    return list_facts(out)
+
+
+def run_line(out, workers=2, **options):
+    arms = {"none": LineAgent(0.5, **options), "warp": LineAgent(0.8, **options)}
+    return run_arms(LineTask(), arms, 10, out=out, progress=False, engine="ray", workers=workers, live=2)
+
+
+@pytest.mark.parametrize("workers", [1, 2])
+def test_one_and_two_actors_record_what_one_process_does(ray, reference, tmp_path, workers):
+    run_line(tmp_path / "run", workers).close()
+    assert list_facts(tmp_path / "run") == reference
+    assert ray.is_initialized()  # it was there before
+
+
+def test_a_lost_actor_costs_the_episodes_in_flight_and_nothing_else(ray, reference, tmp_path):
+    """Its process is killed at decision 1 of episode 6, once."""
+    run_line(tmp_path / "run", kill=(6,), marker=str(tmp_path / "marker")).close()
+    assert list_facts(tmp_path / "run") == reference
+
+
+class ActorInThisProcess:
+    """An actor that is lost after the first row of a job of three episodes."""
+
+    def __init__(self, spec, threads):
+        self.jobs = []
+        self.prepare = SimpleNamespace(remote=lambda: "started")
+        self.run = SimpleNamespace(options=lambda **options: SimpleNamespace(remote=self.start))
+
+    def start(self, job):
+        self.jobs.append(job)
+        for index, episode in job.episodes:
+            yield [OutcomeRow(job.arm, EpisodeResult(index, episode.episode_id, episode.scene, "done"))]
+            if len(job.episodes) == 3:
+                yield RuntimeError("lost")
+
+
+def test_actors_without_work_take_that_of_a_lost_one():
+    def get(row):
+        if isinstance(row, RuntimeError):
+            raise row
+        return row
+
+    def start(*given):
+        made.append(ActorInThisProcess(*given))
+        return made[-1]
+
+    made, rows = [], []
+    played = SimpleNamespace(
+        remote=lambda **options: lambda kind: SimpleNamespace(remote=start),
+        wait=lambda waiting, timeout: (waiting, []),
+        get=get,
+        nodes=lambda: [{}],
+        exceptions=SimpleNamespace(RayActorError=RuntimeError, RayTaskError=KeyError),
+    )
+    episodes = list(enumerate(LineTask().episodes(4)))
+    jobs = deque([Job("none", tuple(episodes[:1])), Job("none", tuple(episodes[1:]))])
+    receiver = SimpleNamespace(write=rows.append, discard=lambda arm, lost: None)
+    spec = WorkerSpec(None, {}, 0, "", 4, frozenset())
+    ray_engine._ActorPool(played, spec, jobs, receiver, 2, EngineConfig(engine="ray")).run()
+    assert sorted(row.result.episode for row in rows) == [0, 1, 2, 3]
+    assert [len(actor.jobs) for actor in made] == [2, 1, 1]  # the first, the lost one, and the one in its place
+
+
+def test_an_episode_that_kills_every_actor_is_an_error_after_three_tries(ray, tmp_path):
+    log = run_line(tmp_path / "run", kill=(6,))
+    errors = [row for row in log.episodes if row["status"] == "error"]
+    assert [(row["arm"], row["episode"], row["kind"]) for row in errors] == [
+        ("none", 6, "worker"),
+        ("warp", 6, "worker"),
+    ]
+    assert all("the worker process died three times on this episode" in row["error"] for row in errors)
+    assert len(log.episodes) == 20
+
+
+def test_actors_that_are_killed_at_any_time_change_nothing(ray, reference, tmp_path, monkeypatch):
+    """Five actors are killed from outside, each once a row of its has come."""
+    killed, receive = [], ray_engine._ActorPool._receive
+
+    def receive_and_kill(pool, lease):
+        receive(pool, lease)
+        if lease.job is not None and lease.job.attempt == 0 and len(killed) < 5:
+            killed.append(lease.actor)
+            ray.kill(lease.actor)
+
+    monkeypatch.setattr(ray_engine._ActorPool, "_receive", receive_and_kill)
+    run_line(tmp_path / "run").close()
+    assert len(killed) == 5 and list_facts(tmp_path / "run") == reference
+
+
+def test_a_broken_contract_stops_the_run_as_in_this_process(ray, tmp_path):
+    method = "    def propose(self, situations, candidates, horizon):\n        return 3\n"
+    (tmp_path / "bad.py").write_text(f"import wiw\n\nclass Bad(wiw.Policy):\n{method}")
+    with pytest.raises(ContractError, match="propose"):
+        evaluate(
+            TaskRecipe(TASK),
+            AgentRecipe(f"{tmp_path}/bad.py:Bad"),
+            2,
+            out=tmp_path / "run",
+            progress=False,
+            engine="ray",
+        )
+
+
+def test_scenes_with_few_episodes_share_a_job():
+    """Else a model would be asked for two episodes at a time, however many are to be live."""
+    episodes = LineTask().episodes(10)  # two of a scene
+    assert _group_by_scene(range(10), episodes, 2) == [[0, 1], [2, 3], [4, 5], [6, 7], [8, 9]]
+    assert _group_by_scene(range(10), episodes, 3) == [[0, 1, 2, 3], [4, 5, 6, 7], [8, 9]]
+    assert _group_by_scene([9, 0, 8, 1], episodes, 2) == [[9, 8], [0, 1]]
+    assert _group_by_scene([], episodes, 2) == []
+
+
+def test_jobs_are_of_one_scene(ray, tmp_path, monkeypatch):
+    leased, assign = [], ray_engine._ActorPool._assign
+
+    def assign_and_note(pool, lease):
+        assign(pool, lease)
+        leased.extend([lease.job] if lease.job is not None else [])
+
+    monkeypatch.setattr(ray_engine._ActorPool, "_assign", assign_and_note)
+    run_line(tmp_path / "run").close()
+    assert all(len({episode.scene for _, episode in job.episodes}) == 1 for job in leased)
+    assert sum(len(job.episodes) for job in leased) == 20
+
+
+def test_a_driver_that_is_stopped_is_resumed_in_processes(tmp_path):
+    pytest.importorskip("ray", reason="needs ray: pip install 'wiw[ray]'")
+    out = tmp_path / "run"
+    command = ["run", TASK, "--policy", "heuristic", "--scenes", "slow", "--episodes", "12", "--live", "1"]
+    command += ["--salt", "7"]
+    command += ["--out", str(out), "--engine", "ray", "--workers", "2", "--no-report"]
+    environment = {**os.environ, "PYTHONPATH": os.pathsep.join(sys.path), "OMP_NUM_THREADS": "1"}
+    driver = subprocess.Popen([sys.executable, "-m", "wiw.cli", *command], env=environment)
+    while driver.poll() is None and count_ended(out) < 3:
+        time.sleep(0.05)
+    driver.send_signal(signal.SIGTERM)
+    assert driver.wait(60) == 75  # Ray's own handler would end it otherwise
+    assert 3 <= count_ended(out) < 12
+    resume_run(out, progress=False, engine={"engine": "processes"}).close()
+    assert main([*command[:12], "--out", str(tmp_path / "whole"), "--no-report"]) == 0
+    assert list_facts(out) == list_facts(tmp_path / "whole")
+
+
+def count_ended(out):
+    with suppress(FileNotFoundError, StoreError):  # it is being created
+        return len(load_run(out).episodes)
+    return 0
+
+
+def test_without_ray_or_a_cluster_it_is_said(tmp_path, monkeypatch):
+    with pytest.raises(ArgumentError, match="give --engine ray"):
+        RunConfig(address="auto")
+    evaluate(TaskRecipe(TASK), AgentRecipe("heuristic"), 1, out=tmp_path / "here", progress=False).close()
+    with pytest.raises(ArgumentError, match="resume: address requires engine ray"):
+        resume_run(tmp_path / "here", engine={"address": "auto"})
+    with pytest.raises(ArgumentError, match="worker_gpus of at least 0"):
+        RunConfig(engine="ray", worker_gpus=-1)
+    monkeypatch.setitem(sys.modules, "ray", None)
+    with pytest.raises(DependencyError, match=r"wiw\[ray\]"):
+        run_line(tmp_path / "run")
+    assert not (tmp_path / "run").exists()
+
+
+def test_objects_that_cannot_be_sent_are_refused(ray, tmp_path):
+    agent = LineAgent(0.5)
+    agent.model = lambda: None
+    with pytest.raises(InfrastructureError, match="cannot be sent to worker processes"):
+        run_arms(LineTask(), {"none": agent}, 2, out=tmp_path / "run", progress=False, engine="ray")

@@ -1,0 +1,54 @@
+# SPDX-License-Identifier: Apache-2.0
+"""A cluster of several nodes, played on one machine, loses one of them: the run goes on elsewhere and is the same."""
+
+from __future__ import annotations
+
+import os
+import sys
+
+import pytest
+from locations import PYTHON_TESTS
+from run_facts import list_facts
+from test_ray_servers import run_walk
+
+from wiw.runs import ray_servers
+
+pytestmark = pytest.mark.nightly
+
+
+@pytest.fixture
+def cluster(tmp_path, monkeypatch):
+    """A head that runs no actors, and two nodes of a core and a GPU, which Ray only counts."""
+    ray = pytest.importorskip("ray", reason="needs ray: pip install 'wiw[ray]'")
+    from ray.cluster_utils import Cluster
+
+    monkeypatch.setenv("PYTHONPATH", os.pathsep.join([str(PYTHON_TESTS), *sys.path]))
+    monkeypatch.setenv("RAY_USAGE_STATS_ENABLED", "0")
+    monkeypatch.setenv("OMP_NUM_THREADS", "1")
+    monkeypatch.setenv("CALLS", str(tmp_path / "calls"))
+    made = Cluster(initialize_head=True, head_node_args={"num_cpus": 0, "object_store_memory": 10**8})
+    made.workers = [made.add_node(num_cpus=1, num_gpus=1, object_store_memory=10**8) for _ in range(2)]
+    ray.init(address=made.address, log_to_driver=False)
+    try:
+        yield made
+    finally:
+        ray.shutdown()
+        made.shutdown()
+
+
+def test_a_lost_node_takes_its_actor_and_its_server_with_it_and_nothing_else(cluster, tmp_path, monkeypatch):
+    run_walk(tmp_path / "here").close()
+    removed, note = [], ray_servers.ServerPool.note_progress
+
+    def remove_once(pool):
+        note(pool)
+        if not removed and len(pool):
+            removed.append([server.node for server in pool._servers])
+            (lost,) = [node for node in cluster.workers if node.node_id == pool._servers[0].node]
+            cluster.remove_node(lost)
+            cluster.add_node(num_cpus=1, num_gpus=1, object_store_memory=10**8)
+
+    monkeypatch.setattr(ray_servers.ServerPool, "note_progress", remove_once)
+    run_walk(tmp_path / "run", engine="ray", workers=2, live=2, servers=2, server_gpus=1).close()
+    assert len(set(removed[0])) == 2, "a server on each node, for each has one GPU"
+    assert list_facts(tmp_path / "run") == list_facts(tmp_path / "here")

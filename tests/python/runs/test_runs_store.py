@@ -1,0 +1,262 @@
+# SPDX-License-Identifier: Apache-2.0
+import gzip
+import json
+import sqlite3
+from contextlib import closing
+
+import numpy as np
+import pytest
+from fakes import LineTask
+from locations import TESTS
+
+import wiw
+from wiw import benchmark
+from wiw.errors import ArgumentError, StoreError
+from wiw.runs.judges import JudgedRow, JudgeRecord
+from wiw.runs.rows import OutcomeRow, decision_row, decode_jpeg, encode_jpeg, strip, to_json
+from wiw.runs.store import SCHEMA_VERSION, RunStore
+from wiw.studies.run_log import load_run
+from wiw.types import Decision, DecisionRecord, EpisodeResult, Goal, Observation, Proposal, Rollout, Truth
+
+ARMS = [{"name": "none", "agent": {"policy": "line"}}, {"name": "warp", "agent": {"policy": "line", "model": "warp"}}]
+CONFIG = {"task": {"task": "line"}, "seed": 0, "episodes": 3, "arms": ARMS}
+INFO = {"pictures": [0], "task": None, "agents": {}, "live": 1, "workers": 1, "limits": {}}
+
+
+def record(episode, index, rollouts=True):
+    panorama = np.full((32, 64, 3), 120, np.uint8)
+    frames = np.zeros((5, 24, 24, 3), np.uint8)
+    decision = Decision(
+        np.array([1, 1, 2]),
+        2,
+        (Proposal([1, 1, 2], 0.5, "straight"), Proposal([2])),
+        (Rollout(frames, np.zeros(5, bool)),) * 2 if rollouts else None,
+        np.array([0.25, np.nan]),
+        0,
+        Observation(panorama, panorama, np.zeros(3)),
+        Goal("line", image=panorama),
+        None,
+        {"propose": 0.1},
+        {"rows": 2},
+        "a note",
+    )
+    before = Truth(np.array([1.0, 0.0, 2.0]), 0.5, 3.0, float("inf"))
+    return DecisionRecord(episode, index, decision, np.array([1, 1]), before, before, np.zeros((3, 3)))
+
+
+def make_result(episode, **metrics):
+    return EpisodeResult(episode, f"{episode:04d}", "line/0", "done", {"success": 1.0, "actions": 4.0, **metrics}, 1.5)
+
+
+@pytest.fixture
+def run(tmp_path):
+    with RunStore.create(tmp_path / "run", CONFIG, INFO, LineTask().episodes(3)) as store:
+        yield store
+
+
+def test_what_is_written_is_read_back(run):
+    run.write(decision_row("warp", record(0, 0), with_images=True))
+    run.write(OutcomeRow("warp", make_result(0)))
+    with RunStore.read(run.path.parent) as reader:
+        (decision,) = reader.decisions("warp", 0)
+        (outcome,) = reader.outcomes()
+        images = reader.images("warp", 0, 0)
+        assert reader.episodes() == LineTask().episodes(3)
+        assert reader.config == CONFIG and reader.wiw_version == wiw.__version__
+    assert decision["actions"] == [1, 1, 2] and decision["executed"] == [1, 1] and decision["chosen"] == 0
+    assert decision["proposals"][0] == {"actions": [1, 1, 2], "prior": 0.5, "note": "straight"}
+    assert decision["scores"] == [0.25, None]
+    assert decision["before_geodesic"] == float("inf") and decision["before_z"] == 2.0
+    assert outcome["metrics"] == {"success": 1.0, "actions": 4.0} and outcome["scene"] == "line/0"
+    assert sorted(images) == ["goal", "imagined/0", "imagined/1", "panorama"]
+    assert decode_jpeg(images["imagined/0"]).shape == (160, 5 * 160, 3)
+
+
+def test_the_file_is_plain_sqlite_in_wal_mode(run):
+    with sqlite3.connect(run.path) as other:
+        assert other.execute("PRAGMA journal_mode").fetchone() == ("wal",)
+        names = {row[0] for row in other.execute("SELECT name FROM sqlite_master WHERE type = 'table'")}
+    assert {"run", "episode", "outcome", "decision", "image"} <= names
+
+
+def test_pictures_only_where_wanted_and_goal_once(run):
+    assert not decision_row("warp", record(1, 0), with_images=False).images
+    assert "goal" not in decision_row("warp", record(0, 1), with_images=True).images
+    assert set(decision_row("none", record(0, 1, rollouts=False), with_images=True).images) == {"panorama"}
+
+
+def test_partial_episodes_are_discarded_on_resume_and_never_shown(run, tmp_path):
+    run.write(decision_row("warp", record(0, 0), with_images=True))
+    run.write(OutcomeRow("warp", make_result(0)))
+    run.write(decision_row("warp", record(1, 0), with_images=True))
+    assert len(run.decisions()) == 1
+    run.close()
+    with RunStore.resume(tmp_path / "run", CONFIG) as store:
+        assert store.pending("warp") == [1, 2] and store.pending("none") == [0, 1, 2]
+        assert store.images("warp", 1, 0) == {} and store.images("warp", 0, 0) != {}
+        store.write(decision_row("warp", record(1, 0), with_images=True))
+
+
+def test_episodes_with_errors_are_pending_only_when_asked(run):
+    run.write(OutcomeRow("warp", EpisodeResult(1, "0001", "line/0", "error", error="disk")))
+    assert run.pending("warp") == [0, 2] and run.pending("warp", retry_errors=True) == [0, 1, 2]
+
+
+@pytest.fixture
+def old_run(tmp_path, monkeypatch):
+    """A run of two episodes with schema version 7, in which the second ended with an error, called "failed" then."""
+    dump = gzip.decompress((TESTS / "data" / "run_schema_7.sql.gz").read_bytes()).decode()
+    folder = tmp_path / "old"
+    folder.mkdir()
+    with closing(sqlite3.connect(folder / "run.sqlite")) as connection:
+        connection.executescript(dump)
+        ((version,),) = connection.execute("SELECT wiw_version FROM run")
+    monkeypatch.setattr(wiw, "__version__", version)
+    monkeypatch.setattr(benchmark, "VERSION", benchmark.FIRST)
+    return folder
+
+
+def version_and_statuses(folder):
+    with closing(sqlite3.connect(folder / "run.sqlite")) as connection:
+        ((version,),) = connection.execute("PRAGMA user_version")
+        return version, [status for (status,) in connection.execute("SELECT status FROM outcome ORDER BY episode")]
+
+
+def test_a_store_of_an_older_schema_is_read_as_it_lies(old_run):
+    log = load_run(old_run)
+    assert [row["status"] for row in log.episodes] == ["done", "error"]
+    assert log.numbers()["none"].errors == 1 and log.numbers()["none"].done == 1 and len(log.decisions) == 5
+    assert log.store.pending("none") == [] and log.store.pending("none", retry_errors=True) == [1]
+    assert "no such scene" in log.report().read_text()
+    assert log.store.judges == [] and log.store.judged_outcomes("any") == {}
+    log.close()
+    assert version_and_statuses(old_run) == (7, ["done", "failed"])
+
+
+def test_a_store_of_an_older_schema_is_updated_when_marks_are_added(old_run):
+    with RunStore.annotate(old_run) as store:
+        store.add_judge(JudgeRecord({"judge": "strict"}))
+        store.write_judged(JudgedRow(store.judges[0].digest, "none", 0, {"success": 0.0}, {}))
+    with RunStore.read(old_run) as store:
+        store.use_judge("strict")
+        assert [row["metrics"].get("success") for row in store.outcomes()] == [0.0, None]
+        assert store.recorded_outcomes()[0]["metrics"]["success"] == 1.0
+    assert version_and_statuses(old_run) == (SCHEMA_VERSION, ["done", "error"])
+
+
+def test_marks_are_written_once_and_errors_replaced(run):
+    run.write(OutcomeRow("warp", EpisodeResult(0, "0000", "line/0", "done", {"success": 1.0})))
+    judge = JudgeRecord({"judge": "strict"})
+    run.add_judge(judge)
+    for row in (
+        JudgedRow(judge.digest, "warp", 0, {}, {}, "no mark", "judge/empty"),
+        JudgedRow(judge.digest, "warp", 0, {"success": 0.0}, {}),
+        JudgedRow(judge.digest, "warp", 0, {"success": 1.0}, {}),
+        JudgedRow(judge.digest, "warp", 0, {}, {}, "no mark", "judge/empty"),
+    ):
+        run.write_judged(row)
+    (found,) = run.judged_outcomes(judge.digest).values()
+    assert found["status"] == "done" and found["metrics"] == {"success": 0.0} and not found["error"]
+
+
+def test_a_store_of_an_older_schema_is_updated_when_it_is_resumed(old_run):
+    with RunStore.resume(old_run) as store:
+        assert store.pending("none", retry_errors=True) == [1] and len(store.decisions()) == 5
+        store.discard("none", [1])
+        store.write(OutcomeRow("none", EpisodeResult(1, "0001", "line/0", "error", error="disk")))
+    assert version_and_statuses(old_run) == (SCHEMA_VERSION, ["done", "error"])
+    with RunStore.read(old_run) as store:
+        assert [row["error"] for row in store.outcomes()] == ["", "disk"]
+    with closing(sqlite3.connect(old_run / "run.sqlite")) as connection, pytest.raises(sqlite3.IntegrityError):
+        connection.execute("UPDATE outcome SET status = 'failed'")
+
+
+@pytest.mark.parametrize("version", [6, SCHEMA_VERSION + 1])
+def test_a_store_of_an_unknown_schema_is_refused(old_run, version):
+    with closing(sqlite3.connect(old_run / "run.sqlite")) as connection:
+        connection.execute(f"PRAGMA user_version = {version}")
+    for open_store in (RunStore.read, RunStore.resume):
+        with pytest.raises(StoreError, match=f"schema version {version}; .*reads versions 7 to {SCHEMA_VERSION}"):
+            open_store(old_run)
+
+
+def test_two_writers_are_refused(run):
+    with pytest.raises(StoreError, match="another process"):
+        RunStore.resume(run.path.parent)
+
+
+def test_an_existing_run_is_not_overwritten(run):
+    with pytest.raises(StoreError, match="wiw resume"):
+        RunStore.create(run.path.parent, CONFIG, INFO, [])
+
+
+def test_a_creation_that_was_cut_off_is_done_again(tmp_path):
+    (tmp_path / "run.sqlite").touch()
+    with pytest.raises(StoreError, match="cut off"):
+        RunStore.read(tmp_path)
+    with RunStore.create(tmp_path, CONFIG, INFO, LineTask().episodes(2)) as store:
+        assert store.pending("none") == [0, 1]
+
+
+def test_another_configuration_is_refused_by_name(run, tmp_path):
+    run.close()
+    with pytest.raises(StoreError, match=r"seed: the run has 0, now 1"):
+        RunStore.resume(tmp_path / "run", {**CONFIG, "seed": 1})
+
+
+@pytest.mark.parametrize(
+    ("statement", "message"),
+    [
+        ("PRAGMA user_version = 99", "schema version 99"),
+        ("UPDATE run SET wiw_version = '0.0.1'", r"wiw 0\.0\.1"),
+        ("PRAGMA application_id = 1", "not a run store"),
+    ],
+)
+def test_another_version_is_refused(run, tmp_path, statement, message):
+    run.close()
+    with sqlite3.connect(tmp_path / "run" / "run.sqlite") as other:
+        other.execute(statement)
+    with pytest.raises(StoreError, match=message):
+        RunStore.resume(tmp_path / "run", CONFIG)
+
+
+def test_damaged_and_missing_stores_are_named(tmp_path):
+    (tmp_path / "run.sqlite").write_bytes(b"not a database, but long enough to be looked at" * 40)
+    with pytest.raises(StoreError, match=r"run\.sqlite.*not a database"):
+        RunStore.read(tmp_path)
+    with pytest.raises(StoreError, match="no run at"):
+        load_run(tmp_path / "nowhere")
+
+
+def test_records_become_data_frames(run):
+    pytest.importorskip("pandas")
+    run.write(decision_row("warp", record(0, 0), with_images=False))
+    run.write(OutcomeRow("warp", make_result(0)))
+    log = load_run(run.path.parent)
+    assert list(log.episodes.to_pandas()["success"]) == [1.0]
+    assert list(log.decisions.to_pandas()["arm"]) == ["warp"]
+    assert log.table()[1]["success"] == 100.0 and log.table()[1]["n"] == 1
+    assert not log.complete and "warp" in repr(log)
+
+
+def test_json_is_standard_and_refuses_what_it_cannot_hold():
+    assert json.loads(to_json({"a": np.float32(0.5), "b": [np.nan, np.inf], "c": np.arange(2)})) == {
+        "a": 0.5,
+        "b": [None, None],
+        "c": [0, 1],
+    }
+    with pytest.raises(ArgumentError, match="numbers, text"):
+        to_json({"model": object()})
+
+
+def test_strips_put_frames_side_by_side_and_views_above_one_another():
+    frames = np.stack([np.full((8, 16, 3), 10 * k, np.uint8) for k in range(3)])
+    flat = strip(frames, height=4)
+    assert flat.shape == (4, 24, 3) and list(flat[0, ::8, 0]) == [0, 10, 20]
+    assert strip(np.stack([frames, frames], axis=1), height=4).shape == (8, 24, 3)
+
+
+def test_jpeg_keeps_colour_order():
+    image = np.zeros((16, 16, 3), np.uint8)
+    image[..., 0] = 200
+    assert decode_jpeg(encode_jpeg(image))[8, 8].argmax() == 0

@@ -1,0 +1,342 @@
+# SPDX-License-Identifier: Apache-2.0
+"""A run in shards: merged it is equal, row by row, to the run of one process."""
+
+from __future__ import annotations
+
+import os
+import shutil
+import signal
+import sqlite3
+import subprocess
+import sys
+from contextlib import closing
+from pathlib import Path
+
+import pytest
+from locations import PYTHON_TESTS
+
+import wiw
+from wiw.cli import main
+from wiw.errors import ArgumentError, FileError, StoreError
+from wiw.runs import file_systems, scratch
+from wiw.runs.recipes import AgentRecipe, TaskRecipe
+from wiw.runs.shards import Shard
+from wiw.runs.store import RunStore
+from wiw.runs.store_file import store_path
+from wiw.studies.evaluate import evaluate, resume_run
+from wiw.studies.run_log import load_run
+
+TASK = f"{PYTHON_TESTS / 'fakes.py'}:line_task"
+TABLES = {
+    "episode": "episode",
+    "outcome": "arm, episode",
+    "decision": "arm, episode, decision",
+    "image": "arm, episode, decision, name",
+    "film": "arm, episode",
+    "scene_map": "scene",
+    "lost": "arm, name",
+}
+"""By name, with the columns that order their rows."""
+TIMES = {"outcome": ("seconds",), "decision": ("seconds", "spent", "calls")}
+"""Columns that are not promised to be equal."""
+
+
+def begin(out, episodes=7, agent="heuristic", **options):
+    task = TaskRecipe(TASK, options.pop("task", {}))
+    return evaluate(task, AgentRecipe(agent), episodes, out=out, progress=False, **{"live": 3, "salt": "s", **options})
+
+
+def read_rows(run):
+    """Return all rows of a store by table, but for what is not promised to be equal, and its config."""
+    with closing(sqlite3.connect(store_path(run))) as store:
+        store.row_factory = sqlite3.Row
+        rows = {
+            table: [
+                {name: row[name] for name in row.keys() if name not in TIMES.get(table, ())}  # noqa: SIM118 - a Row
+                for row in store.execute(f"SELECT * FROM {table} ORDER BY {order}")
+            ]
+            for table, order in TABLES.items()
+        }
+        return rows, store.execute("SELECT config FROM run").fetchone()[0]
+
+
+def run_shards(folder, count, **options):
+    for number in range(1, count + 1):
+        begin(folder / str(number), shard=f"{number}/{count}", **options).close()
+    return [folder / str(number) for number in range(1, count + 1)]
+
+
+@pytest.mark.parametrize(("episodes", "count"), [(7, 1), (7, 2), (7, 3), (7, 7), (100, 8), (3, 2)])
+def test_shards_are_a_partition_of_about_equal_parts(episodes, count):
+    parts = [Shard(number, count).select(episodes) for number in range(1, count + 1)]
+    assert [index for part in parts for index in part] == list(range(episodes))
+    assert max(map(len, parts)) - min(map(len, parts)) <= 1
+    assert Shard.parse(str(Shard(count, count))) == Shard(count, count)
+
+
+@pytest.mark.parametrize("text", ["0/3", "4/3", "3", "1/0", "a/b", "1/2/3", "-1/2", ""])
+def test_no_shard_is_refused(tmp_path, text):
+    with pytest.raises(ArgumentError, match=f"shard I/N .* got '{text}'"):
+        begin(tmp_path / "run", shard=text)
+    with pytest.raises(ArgumentError, match="with 2 episodes"):
+        begin(tmp_path / "run", 2, shard="3/3")
+    assert not (tmp_path / "run").exists()
+
+
+def test_merged_shards_equal_the_run_of_one_process(tmp_path):
+    begin(tmp_path / "whole").close()
+    found = wiw.merge(run_shards(tmp_path / "parts", 3), tmp_path / "merged")
+    assert (found.stores, found.ended, found.complete, found.repeated, found.unlike) == (3, 7, True, 0, ())
+    assert read_rows(tmp_path / "merged") == read_rows(tmp_path / "whole")
+    assert len(read_rows(tmp_path / "whole")[0]["image"]) > 0
+    assert wiw.verify(tmp_path / "merged", episodes=7).same
+    one, other = (load_run(tmp_path / name) for name in ("merged", "whole"))
+    assert one.table() == other.table() and one.complete and one.store.shard is None
+    assert one.store.created == min(each["created"] for each in one.store.info["merged"])
+    assert [each["shard"] for each in one.store.info["merged"]] == ["1/3", "2/3", "3/3"]
+
+
+def test_with_world_models_pictures_and_scene_maps(tmp_path, two_rooms):
+    task = TaskRecipe("imagenav", {"scenes": two_rooms, "decisions": 1, "backend": "cpu"})
+
+    def run(name, **options):
+        given = {"salt": "s", "arms": ["none", "placebo-swapped"], "progress": False, "keep_images": 1}
+        evaluate(task, AgentRecipe("matcher", candidates=2), 3, out=tmp_path / name, **given, **options).close()
+
+    run("whole", live=2)
+    for number in (1, 2):
+        run(f"parts/{number}", shard=f"{number}/2", live=3)
+    wiw.merge([tmp_path / "parts"], tmp_path / "merged")
+    rows, config = read_rows(tmp_path / "merged")
+    assert (rows, config) == read_rows(tmp_path / "whole")
+    assert rows["image"] and rows["scene_map"]
+    assert {row["episode"] for row in rows["image"]} == set(load_run(tmp_path / "merged").store.info["pictures"])
+
+
+def test_the_command_line_runs_merges_and_compares(tmp_path, capsys):
+    def run(*arguments):
+        given = ["--policy", "heuristic", "--episodes", "5", "--salt", "s", *map(str, arguments)]
+        assert main(["run", TASK, *given]) == 0
+        return capsys.readouterr()
+
+    run("--out", tmp_path / "whole", "--no-report")
+    shown = [run("--out", tmp_path / "parts" / str(i), "--shard", f"{i}/2", "--resume") for i in (1, 2)]
+    assert all("shard   " in each.err and "merge all shards with `wiw merge`" in each.out for each in shown)
+    assert not list((tmp_path / "parts").rglob("report.html"))
+    assert main(["merge", str(tmp_path / "parts"), "--out", str(tmp_path / "merged")]) == 0
+    assert "5 episodes from 2 stores" in capsys.readouterr().out
+    assert main(["report", str(tmp_path / "merged")]) == 0 and (tmp_path / "merged/report.html").exists()
+    assert main(["verify", str(tmp_path / "merged")]) == 0
+    assert main(["compare", str(tmp_path / "whole"), str(tmp_path / "merged")]) == 0
+    assert read_rows(tmp_path / "merged") == read_rows(tmp_path / "whole")
+    assert main(["merge", str(tmp_path / "parts"), "--out", str(tmp_path / "merged")]) == 2
+    assert "already holds a run" in capsys.readouterr().err
+
+
+def test_missing_episodes_are_named_and_can_be_run(tmp_path, capsys):
+    parts = run_shards(tmp_path / "parts", 3)
+    found = wiw.merge(parts[:2], tmp_path / "merged")
+    assert not found.complete and dict(found.pending) == {"none": 3} and "wiw resume" in str(found)
+    resume_run(tmp_path / "merged", progress=False).close()
+    begin(tmp_path / "whole").close()
+    assert read_rows(tmp_path / "merged") == read_rows(tmp_path / "whole")
+
+
+@pytest.mark.parametrize(
+    ("changed", "named"),
+    [
+        ({"seed": 5}, "seed: 0 and 5"),
+        ({"episodes": 8}, "episodes: 7 and 8"),
+        ({"task": {"seed": 4}}, "task.seed: 0 and 4"),
+        ({"agent": "matcher"}, r"arms\[0\].agent.policy: \"heuristic\" and \"matcher\""),
+        ({"fidelity": True}, "fidelity: false and true"),
+    ],
+)
+def test_stores_of_unlike_runs_are_refused_and_the_difference_is_named(tmp_path, changed, named):
+    begin(tmp_path / "1", shard="1/2").close()
+    if changed.get("agent") == "matcher":  # is not made for this task
+        begin(tmp_path / "2", shard="2/2").close()
+        edit(tmp_path / "2", "UPDATE run SET config = replace(config, 'heuristic', 'matcher')")
+    else:
+        begin(tmp_path / "2", shard="2/2", **changed).close()
+    with pytest.raises(StoreError, match=f"not from the same run: {named}"):
+        wiw.merge([tmp_path / "1", tmp_path / "2"], tmp_path / "merged")
+    assert not (tmp_path / "merged").exists()
+
+
+def test_unlike_agents_are_refused_though_the_first_store_has_not_begun_that_arm(tmp_path):
+    parts = run_shards(tmp_path, 3)
+    edit(parts[0], "UPDATE run SET info = json_remove(info, '$.built.none')")
+    assert wiw.merge(parts, tmp_path / "merged").complete
+    edit(parts[2], "UPDATE run SET info = json_set(info, '$.built.none.weights', 'others')")
+    with pytest.raises(
+        StoreError, match=r"2 and .*3 had different agents: agent none.weights: \"absent\" and \"others\""
+    ):
+        wiw.merge(parts, tmp_path / "again")
+
+
+def test_a_merge_of_nothing_is_refused(tmp_path, capsys):
+    assert main(["merge", "--out", str(tmp_path / "merged")]) == 2
+    assert "expected at least one run" in capsys.readouterr().err and not (tmp_path / "merged").exists()
+
+
+def edit(run, statement):
+    with closing(sqlite3.connect(store_path(run))) as store, store:
+        assert store.execute(statement).rowcount == 1
+
+
+def test_an_episode_in_two_stores_counts_once(tmp_path):
+    parts = run_shards(tmp_path / "parts", 2)
+    shutil.copytree(parts[0], tmp_path / "copy")
+    found = wiw.merge([*parts, tmp_path / "parts", tmp_path / "copy"], tmp_path / "merged")
+    assert found.stores == 3  # named twice
+    assert (found.ended, found.repeated, found.unlike) == (7, 3, ())
+    edit(tmp_path / "copy", "UPDATE decision SET note = 'edited' WHERE episode = 1 AND decision = 0")
+    found = wiw.merge([*parts, tmp_path / "copy"], tmp_path / "first")
+    assert found.repeated == 2 and found.unlike == ('none episode 1: decision 0: note: recorded "", now "edited"',), (
+        found.unlike
+    )
+    found = wiw.merge([tmp_path / "copy", *parts], tmp_path / "other")
+    notes = [[row["note"] for row in read_rows(tmp_path / name)[0]["decision"]] for name in ("first", "other")]
+    assert "edited" not in notes[0] and "edited" in notes[1]  # the first wins
+    assert sum(load_run(tmp_path / "first").store.sum_lost_costs()["none"].values()) > 0  # work done twice
+
+
+def test_unlike_records_of_built_in_parts_are_refused(tmp_path, two_rooms):
+    task = TaskRecipe("imagenav", {"scenes": two_rooms, "decisions": 1, "backend": "cpu"})
+    evaluate(task, AgentRecipe("heuristic"), 1, out=tmp_path / "1", progress=False).close()
+    shutil.copytree(tmp_path / "1", tmp_path / "2")
+    assert wiw.merge([tmp_path / "1", tmp_path / "2"], tmp_path / "merged").repeated == 1
+    edit(tmp_path / "2", "UPDATE decision SET after_x = after_x + 1e-9")
+    with pytest.raises(
+        StoreError, match=r"none episode 0 has different records .* its parts guarantee equal ones .*: after_x"
+    ):
+        wiw.merge([tmp_path / "1", tmp_path / "2"], tmp_path / "again")
+
+
+def test_an_episode_that_ended_without_an_error_is_preferred(tmp_path):
+    part = run_shards(tmp_path / "parts", 1)[0]
+    shutil.copytree(part, tmp_path / "broken")
+    edit(tmp_path / "broken", "UPDATE outcome SET status = 'error', metrics = '{}', error = 'lost' WHERE episode = 2")
+    wiw.merge([tmp_path / "broken", part], tmp_path / "merged")
+    assert {row["status"] for row in load_run(tmp_path / "merged").episodes} == {"done"}
+
+
+def test_a_shard_is_resumed_as_that_shard_alone(tmp_path):
+    begin(tmp_path / "run", shard="1/2").close()
+    with pytest.raises(StoreError, match='shard: the run has "1/2", now "2/2"'):
+        begin(tmp_path / "run", shard="2/2", resume=True)
+    begin(tmp_path / "run", shard="1/2", resume=True).close()
+    log = resume_run(tmp_path / "run", progress=False)
+    assert log.complete and len(log.episodes) == 3
+
+
+@pytest.fixture
+def network(tmp_path, monkeypatch):
+    """A folder that the list of mounts says is a network file system."""
+    folder = tmp_path / "net work"
+    folder.mkdir()
+    (tmp_path / "mountinfo").write_text(
+        "22 1 8:1 / / rw,relatime shared:1 - ext4 /dev/sda1 rw\n"
+        f"40 22 0:50 / {str(folder).replace(' ', chr(92) + '040')} rw shared:7 master:2 - nfs4 server:/home rw\n"
+        f"41 40 0:51 / {str(folder).replace(' ', chr(92) + '040')}/disk rw - xfs /dev/sdb1 rw\n"
+    )
+    monkeypatch.setattr(file_systems, "MOUNTS", tmp_path / "mountinfo")
+    return folder
+
+
+def test_network_file_systems_are_told_from_disks(network, tmp_path):
+    places = (network, network / "not/there/yet", network / "disk/run", tmp_path, Path("/"))
+    assert [file_systems.find_network(place) for place in places] == ["nfs4", "nfs4", None, None, None]
+    assert file_systems.find_network(network.with_name("net")) is None  # a longer name is no folder in it
+
+
+def test_a_store_on_a_network_file_system_is_refused_with_the_way_round(network, tmp_path):
+    with pytest.raises(StoreError, match=r"network file system \(nfs4\).*--scratch /tmp.*wiw merge"):
+        begin(network / "run")
+    begin(network / "run", 3, scratch=tmp_path / "local").close()
+    with pytest.raises(StoreError, match="network file system"):
+        resume_run(network / "run", progress=False)
+    assert resume_run(network / "run", progress=False, scratch=tmp_path / "local").complete
+    assert load_run(network / "run").complete and wiw.verify(network / "run").same
+    assert sorted(path.name for path in (network / "run").iterdir()) == ["run.sqlite"]  # neither log nor lock
+    assert list((tmp_path / "local").iterdir()) == []
+    assert wiw.merge([network / "run"], network / "merged").complete
+    assert sorted(path.name for path in (network / "merged").iterdir()) == ["run.sqlite"]
+
+
+def test_a_killed_shard_resumes_from_its_copy_or_from_what_is_left(tmp_path, network, monkeypatch):
+    """The process is killed at decision 1 of episode 5; the copy is made after each episode, or only at the begin."""
+    for period, kept in ((0.0, 5), (1e9, 0)):
+        marker, folder = tmp_path / f"marker{kept}", network / f"run{kept}"
+        program = f"""
+import sys
+sys.path.insert(0, {str(PYTHON_TESTS)!r})
+from fakes import LineAgent, LineTask
+from wiw.runs import scratch
+from wiw.studies.evaluate import run_arms
+scratch.PERIOD = {period}
+run_arms(LineTask(), {{"none": LineAgent(kill=(5,), marker={str(marker)!r})}}, 8, out={str(folder)!r},
+         progress=False, live=1, shard="1/1", salt="", scratch={str(tmp_path / "local")!r}, resume=True)
+"""
+        environment = {**os.environ, "PYTHONPATH": os.pathsep.join(sys.path)}
+        killed = subprocess.run([sys.executable, "-c", program], env=environment, check=False, timeout=100)
+        assert killed.returncode == -signal.SIGKILL
+        assert len(load_run(folder).episodes) == kept
+        if kept:  # another machine, with a disk of its own
+            shutil.rmtree(tmp_path / "local")
+        subprocess.run([sys.executable, "-c", program], env=environment, check=True, timeout=100)
+        log = load_run(folder)
+        assert log.complete and ("none" in log.store.sum_lost_costs()) == (kept == 0)  # decision 0 of episode 5
+        assert log.store.info["session"]["ended"] == 5
+        assert list((tmp_path / "local").iterdir()) == []
+
+
+def test_a_copy_that_cannot_be_made_leaves_the_store_on_the_disk(tmp_path, monkeypatch):
+    monkeypatch.setattr(scratch, "PERIOD", 0.0)
+
+    def fill(source, target):
+        raise OSError(28, "No space left on device")
+
+    with monkeypatch.context() as patch:
+        begin(tmp_path / "run", 2, scratch=tmp_path / "local").close()
+        patch.setattr(scratch.shutil, "copyfile", fill)
+        with pytest.raises(FileError, match="No space left"):
+            begin(tmp_path / "run", 2, scratch=tmp_path / "local", resume=True)
+    left = list((tmp_path / "local").rglob("run.sqlite"))
+    assert len(left) == 1 and load_run(left[0].parent).complete
+    assert begin(tmp_path / "run", 2, scratch=tmp_path / "local", resume=True).complete
+
+
+def test_two_processes_do_not_share_a_scratch_copy(tmp_path):
+    begin(tmp_path / "run", 2).close()
+    local = tmp_path / "local"
+    with (
+        RunStore.resume(tmp_path / "run", scratch=local),
+        pytest.raises(StoreError, match="being written by another process"),
+    ):
+        RunStore.resume(tmp_path / "run", scratch=local)
+    with (
+        RunStore.resume(tmp_path / "run"),
+        pytest.raises(StoreError, match="being written by another process"),
+    ):
+        RunStore.resume(tmp_path / "run", scratch=local)  # which would be lost when the other one's is closed
+
+
+def test_a_merge_that_is_cut_off_leaves_nothing(tmp_path, monkeypatch):
+    parts = run_shards(tmp_path / "parts", 2)
+
+    def stop(store, source, episodes):
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(RunStore, "take_episodes", stop)
+    with pytest.raises(KeyboardInterrupt):
+        wiw.merge(parts, tmp_path / "merged", tmp_path / "local")
+    assert not (tmp_path / "merged").exists() and list((tmp_path / "local").iterdir()) == []
+
+
+def test_stores_that_are_still_written_can_be_merged(tmp_path):
+    run_shards(tmp_path / "parts", 2)
+    with RunStore.resume(tmp_path / "parts/1") as store:
+        store.discard("none", [0])  # is run again just now
+        assert dict(wiw.merge([tmp_path / "parts"], tmp_path / "merged").pending) == {"none": 1}

@@ -1,0 +1,291 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Runs submitted as jobs, by submitit's local executor and by a SLURM that this machine plays."""
+
+from __future__ import annotations
+
+import json
+import os
+import shlex
+import signal
+import stat
+import sys
+import time
+from dataclasses import replace
+from pathlib import Path
+
+import pytest
+from locations import PYTHON_TESTS
+
+import wiw
+from wiw.cli import main
+from wiw.cli.command_line import format_flags
+from wiw.cli.parts import AgentFlags, TaskFlags
+from wiw.errors import ArgumentError, DependencyError, InfrastructureError, StoreError
+from wiw.loop.config import AgentConfig
+from wiw.runs.config import RunConfig
+from wiw.runs.submission import LOGS, ClusterConfig, JobCommand, cancel, find_states, read_jobs, submit_commands
+from wiw.studies.run_log import load_run
+
+submitit = pytest.importorskip("submitit", reason="needs submitit: pip install 'wiw[slurm]'")
+
+TASK = f"{PYTHON_TESTS / 'fakes.py'}:line_task"
+
+
+@pytest.fixture(autouse=True)
+def environment(tmp_path, monkeypatch):
+    """Jobs import what the tests do, and have a disk of their own."""
+    monkeypatch.setenv("PYTHONPATH", os.pathsep.join(sys.path))
+    monkeypatch.setenv("SLURM_TMPDIR", str(tmp_path / "disk"))
+    monkeypatch.setenv("OMP_NUM_THREADS", "1")
+
+
+def submit(out, *arguments, episodes=6, scenes="", shards=2, cluster="local"):
+    own = ["--policy", "heuristic", "--episodes", episodes, "--shards", shards, "--cluster", cluster, "--out", out]
+    return main(["submit", TASK, *map(str, own), *(["--scenes", scenes] if scenes else []), *map(str, arguments)])
+
+
+def wait_for(condition, seconds=60):
+    deadline = time.monotonic() + seconds
+    while not condition():
+        assert time.monotonic() < deadline, "nothing happened"
+        time.sleep(0.05)
+
+
+def have_jobs_ended(out):
+    return lambda: all(job.state not in ("RUNNING", "PENDING") for job in find_states(out))
+
+
+def logs(out):
+    return "\n".join(
+        f"{path}:\n{path.read_text()}" for path in sorted((out / LOGS).glob("*.*")) if path.suffix != ".pkl"
+    )
+
+
+def test_flags_are_written_as_they_are_read(capsys):
+    """Every flag of `wiw run` comes back from the text, as the command line reads it."""
+    import tyro
+
+    config = (tyro.conf.OmitArgPrefixes,)
+    for settings in (
+        RunConfig(episodes=7, seed=3, out=Path("a b/c"), keep_images="all", progress=False, fidelity=True, resume=True),
+        RunConfig(shard="2/3", scratch=Path("/tmp"), deadline=12.5, cache="off", live=9, workers=2),
+        AgentFlags(world_model="svd", world_model_option=("steps=3", "a=b c"), vlm="http://h/v1", prompts="p q"),
+        AgentFlags(policy="vlm", vlm_prices=Path("p.yaml"), tracker="sam2", tracker_option=("weights=w",)),
+        TaskFlags(scenes="apartments:val", task_option=("decisions=2",), motion="slide", backend="cpu"),
+        AgentConfig(depth=2, width=3, execute=-1, candidates=4),
+    ):
+        assert tyro.cli(type(settings), args=format_flags(settings), config=config) == settings
+        assert format_flags(type(settings)()) == []
+
+
+def test_each_job_is_a_command_for_a_person(tmp_path, capsys):
+    assert submit(tmp_path / "run", "--dry-run", "--arms", "none,heuristic+none", "--seed", "3") == 0
+    lines = [line for line in capsys.readouterr().out.splitlines() if line.startswith("wiw run")]
+    assert len(lines) == 2 and not (tmp_path / "run" / "jobs.json").exists()
+    for line in lines:
+        assert main(shlex.split(line)[1:]) == 0
+    wiw.merge([tmp_path / "run"], tmp_path / "run")
+    log = load_run(tmp_path / "run")
+    assert log.complete and log.arms == ["none", "heuristic"] and log.store.config["seed"] == 3
+
+
+def test_jobs_run_are_shown_and_merged(tmp_path, capsys):
+    out = tmp_path / "run"
+    assert submit(out) == 0
+    wait_for(have_jobs_ended(out))
+    assert wiw.status(out).ended == 6, logs(out)
+    assert main(["status", str(out)]) == 0
+    shown = capsys.readouterr().out
+    assert "6/6" in shown and f"job {read_jobs(out)[0].id}  ENDED" in shown and "1/2" in shown
+    assert main(["merge", str(out), "--out", str(out)]) == 0
+    assert load_run(out).complete and wiw.verify(out).same
+    assert submit(out) == 0
+    shown = capsys.readouterr().out.partition("2 stores")[2]
+    assert len(read_jobs(out)) == 2 and "wiw run" not in shown and "there is nothing to submit" in shown
+    with pytest.raises(ArgumentError, match="was submitted with other flags"):
+        raise_from_main(out, "--seed", 4)
+
+
+def raise_from_main(out, *arguments):
+    """Raise what the command line prints."""
+    submit(out, "--debug", *arguments)
+
+
+def find_children(process):
+    return [int(child) for child in Path(f"/proc/{process}/task/{process}/children").read_text().split()]
+
+
+def test_a_job_that_is_interrupted_is_requeued_and_goes_on(tmp_path):
+    """SIGUSR2 goes to submitit's process, as from SLURM before the time limit; then to the command as well."""
+    out = tmp_path / "run"
+    assert submit(out, "--live", 1, scenes="slow", shards=1, episodes=8) == 0
+    (job,) = read_jobs(out)
+    for count, whole_job in ((2, False), (4, True)):
+        wait_for(lambda count=count: (out / "shard-1-of-1/run.sqlite").exists() and count_decisions(tmp_path) >= count)
+        (task,) = find_children(int(job.id))
+        for process in [*(find_children(task) if whole_job else []), task]:
+            os.kill(process, signal.SIGUSR2)
+        wait_for(lambda task=task: find_children(int(job.id)) not in ([task], []))
+    wait_for(have_jobs_ended(out))
+    log = load_run(out / "shard-1-of-1")
+    assert log.complete and len(log.episodes) == 8, logs(out)
+    assert logs(out).count("Requeued job") == 2 and "Traceback" not in logs(out)
+    assert log.store.info["session"]["ended"] > 0  # the last process went on with what was there
+
+
+def count_decisions(tmp_path):
+    """Return how many episodes have ended in the store that the job writes on its own disk."""
+    found = list((tmp_path / "disk").rglob("run.sqlite"))
+    try:
+        return sum(len(load_run(path).episodes) for path in found)
+    except StoreError:  # being made, or copied home just now
+        return 0
+
+
+def test_cancelled_jobs_end_and_keep_what_is_recorded(tmp_path, capsys):
+    out = tmp_path / "run"
+    assert submit(out, "--live", 1, scenes="slow", shards=1, episodes=40) == 0
+    wait_for(lambda: count_decisions(tmp_path) >= 2)
+    with pytest.raises(ArgumentError, match=r"is RUNNING \(1 active in all\); wait for them, or `wiw cancel"):
+        submit_again = ["--live", 1, "--debug"]
+        submit(out, *submit_again, scenes="slow", shards=1, episodes=40)
+    assert main(["cancel", str(out)]) == 0 and "told 1 jobs" in capsys.readouterr().out
+    wait_for(have_jobs_ended(out))
+    found = wiw.status(out)
+    assert 2 <= found.ended < 40 and found.stores[0].state == "stopped"
+    assert cancel(out) == []  # nobody is there
+    with pytest.raises(StoreError, match="no jobs of"):
+        cancel(tmp_path)
+
+
+def test_a_command_that_fails_is_an_error_of_its_job(tmp_path):
+    with pytest.raises(InfrastructureError, match="exit code 2 of: wiw run nothing"):
+        JobCommand(["run", "nothing"])()
+
+
+def test_without_slurm_or_submitit_it_is_said(tmp_path, monkeypatch):
+    with pytest.raises(InfrastructureError, match=r"srun.*--cluster local"):
+        submit_commands(tmp_path, [["--version"]], ClusterConfig())
+    monkeypatch.setitem(sys.modules, "submitit", None)
+    with pytest.raises(DependencyError, match=r"wiw\[slurm\]"):
+        submit_commands(tmp_path, [["--version"]], ClusterConfig())
+    for name in ("minutes", "gpus", "cpus", "requeues", "parallel"):
+        with pytest.raises(ArgumentError, match=f"submit: expected {name} of at least"):
+            replace(ClusterConfig(), **{name: -1})
+    (tmp_path / "jobs.json").write_text("[{}]")
+    with pytest.raises(StoreError, match="damaged"):
+        read_jobs(tmp_path)
+
+
+def test_servers_are_jobs_that_all_shards_ask(tmp_path, two_rooms, capsys):
+    out = tmp_path / "run"
+    (tmp_path / "short.yaml").write_text("base: paper\ndecisions: 1\n")
+    asked = ["imagenav", "--scenes", two_rooms, "--preset", tmp_path / "short.yaml", "--policy", "heuristic"]
+    asked += ["--revision", "matcher", "--episodes", 2, "--candidates", 1, "--world-model", "warp", "--backend", "cpu"]
+    asked += ["--arms", "none,warp"]
+    jobs = ["--shards", 1, "--servers", 1, "--server-gpus", 0, "--cluster", "local", "--out", out]
+    assert main(["submit", *map(str, [*asked, *jobs])]) == 0
+    lines = [shlex.split(line)[1:] for line in capsys.readouterr().out.splitlines() if line.startswith("wiw ")]
+    assert [line[0] for line in lines] == ["serve", "run"]
+    file = out / "servers/1.json"
+    wait_for(file.exists)
+    assert stat.S_IMODE(file.stat().st_mode) == 0o600 and json.loads(file.read_text())["token"]
+    wait_for(lambda: [job.state for job in find_states(out)] == ["RUNNING", "ENDED"], 120)
+    assert main(["run", *map(str, asked), "--out", str(tmp_path / "whole"), "--no-report"]) == 0
+    assert wiw.merge([out], out).complete, logs(out)
+    one, other = load_run(out), load_run(tmp_path / "whole")
+    assert one.arms == other.arms == ["none", "warp"]
+    assert one.store.config["arms"][1]["agent"]["model"] == f"remote:{file.parent}"
+    assert [row["scores"] for row in one.decisions] == [row["scores"] for row in other.decisions]
+    assert main(["submit", *map(str, [*asked, *jobs])]) == 0  # nothing is left, though a server is there
+    assert len(cancel(out)) == 1
+    wait_for(have_jobs_ended(out))
+    assert not file.exists()
+    with pytest.raises(ArgumentError, match="--servers serve --world-model"):
+        submit(tmp_path / "other", "--servers", 1, "--debug")
+
+
+SBATCH = """
+import os, re, subprocess, sys
+script = sys.argv[1]
+text = open(script).read()
+open(os.environ["FAKE_SLURM"] + "/script", "w").write(text)
+first, last = map(int, re.search(r"--array=(\\d+)-(\\d+)", text).groups()) if "--array" in text else (0, 0)
+for number in range(first, last + 1):
+    loop = f'bash {script}; while rm "$FAKE_SLURM/requeue_{number}"; do bash {script}; done'
+    job = {"SLURM_JOB_ID": str(700 + number), "SLURM_ARRAY_JOB_ID": "70", "SLURM_ARRAY_TASK_ID": str(number)}
+    log = open(os.environ["FAKE_SLURM"] + f"/log_{number}", "w")
+    subprocess.Popen(["bash", "-c", loop], env={**os.environ, **job}, stdout=log, stderr=log, start_new_session=True)
+print("Submitted batch job 70")
+"""
+SRUN = """
+import os, sys
+command = sys.argv[1:]
+while command[0].startswith("--"):
+    command = command[1:] if command[0] == "--unbuffered" else command[2:]
+open(os.environ["FAKE_SLURM"] + "/pid_" + os.environ["SLURM_ARRAY_TASK_ID"], "w").write(str(os.getpid()))
+os.execvp(command[0], command)
+"""
+SCONTROL = """
+import os, sys
+assert sys.argv[1] == "requeue" and sys.argv[2].startswith("70_"), sys.argv
+open(os.environ["FAKE_SLURM"] + "/requeue_" + sys.argv[2].partition("_")[2], "w")
+open(os.environ["FAKE_SLURM"] + "/requeued", "a").write(sys.argv[2] + "\\n")
+"""
+SACCT = """
+print("JobID|State|NodeList")
+for number in range(2):
+    print(f"70_{number}|COMPLETED|node1")
+"""
+SCANCEL = """
+import os, sys
+open(os.environ["FAKE_SLURM"] + "/cancelled", "a").write(" ".join(sys.argv[1:]))
+"""
+
+
+@pytest.fixture
+def slurm(tmp_path, monkeypatch):
+    """Commands of SLURM that run jobs on this machine, at once, and note what they are asked."""
+    folder = tmp_path / "slurm"
+    folder.mkdir()
+    for name, code in (
+        ("sbatch", SBATCH),
+        ("srun", SRUN),
+        ("scontrol", SCONTROL),
+        ("sacct", SACCT),
+        ("scancel", SCANCEL),
+    ):
+        program = folder / name
+        program.write_text(f"#!{sys.executable}\n{code}")
+        program.chmod(program.stat().st_mode | stat.S_IXUSR)
+    monkeypatch.setenv("PATH", f"{folder}{os.pathsep}{os.environ['PATH']}")
+    monkeypatch.setenv("FAKE_SLURM", str(folder))
+    return folder
+
+
+def test_an_array_of_slurm_jobs(tmp_path, slurm, capsys):
+    out = tmp_path / "run"
+    asked = ["--partition", "gpu", "--gpus", 1, "--minutes", 30, "--parallel", 1, "--account", "lab", "--memory", 8]
+    assert submit(out, *asked, "--live", 1, cluster="slurm", scenes="slow", episodes=8) == 0
+    script = (slurm / "script").read_text()
+    for line in ("array=0-1%1", "partition=gpu", "gpus-per-node=1", "time=30", "signal=USR2@90", "requeue", "mem=8GB"):
+        assert f"#SBATCH --{line}\n" in script
+    assert [job.id for job in read_jobs(out)] == ["70_0", "70_1"]
+    wait_for(lambda: count_decisions(tmp_path) >= 2)
+    os.kill(int((slurm / "pid_0").read_text()), signal.SIGUSR2)
+    wait_for(lambda: wiw.status(out).ended == 8)
+    assert (slurm / "requeued").read_text() == "70_0\n", logs(out)
+    assert wiw.merge([out], out).complete and wiw.verify(out).same
+    assert main(["cancel", str(out)]) == 0 and (slurm / "cancelled").read_text() == "70"
+    assert "job 70_0" in json.dumps(main(["status", str(out)]) or capsys.readouterr().out)
+
+
+def test_shards_of_which_slurm_says_nothing_are_not_submitted_twice(tmp_path, slurm):
+    (slurm / "sacct").write_text("#!/bin/sh\necho 'JobID|State|NodeList'\n")  # as for a new job
+    submitit.SlurmJob.watcher.clear()
+    out = tmp_path / "run"
+    assert submit(out, cluster="slurm", scenes="slow") == 0
+    with pytest.raises(ArgumentError, match=r"job 70_0 of .* is UNKNOWN \(2 active in all\); .* remove .*jobs.json"):
+        submit(out, "--debug", cluster="slurm", scenes="slow")
+    wait_for(lambda: len(list(out.glob("*/run.sqlite"))) == 2 and wiw.status(out).ended == 6)
+    submitit.SlurmJob.watcher.clear()
