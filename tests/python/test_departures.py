@@ -23,7 +23,7 @@ from wiw.policies.vlm.prompts import Prompts
 from wiw.registry import POLICIES, WORLD_MODELS, task_class
 from wiw.runs.compose import RunContext
 from wiw.runs.departures import EPISODES, find_departures
-from wiw.runs.recipes import AgentRecipe, TaskInMemory
+from wiw.runs.recipes import AgentRecipe, TaskInMemory, TaskRecipe
 from wiw.tasks import presets
 from wiw.tasks.ar import AR
 from wiw.tasks.imagenav import ImageNav
@@ -251,6 +251,7 @@ def test_the_published_code_departs_by_its_rules_with_reasons() -> None:
 
 
 def test_the_papers_diffusion_policy_has_its_own_numbers() -> None:
+    assert TaskRecipe("manipulation", {"preset": "paper-diffusion"}).find_policy() == "diffuser"
     found = find_topics(Manipulation(preset="paper-diffusion"), policy="diffuser", reviser="vlm")
     assert not {"actions", "horizon", "policy"} & found.keys()
     assert find_topics(Manipulation(), policy="diffuser")["horizon"] == "5 (paper: 50)"

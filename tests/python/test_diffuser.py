@@ -327,6 +327,18 @@ def test_what_the_wrist_camera_sees_counts_where_the_network_knows_it(shown: lis
     np.testing.assert_array_equal(seen.actions, unseen.actions)
 
 
+def test_the_included_weights_try_several_targets(shown: list[Demonstration]) -> None:
+    """At tables of other seeds than those of its demonstrations."""
+    policy = wiw.policy("diffuser")
+    assert policy.needs == ("depth", "wrist") and policy.card["demonstrations"]["episodes"] == 120
+    assert policy.card["found"]["near/10"] > 0.75 and policy.card["found"]["spread"] > 0.05
+    block, _ = shown
+    (plans,) = policy.propose([situation(block, Key(3, 1))], 10, 50)
+    ends = np.stack([plan.actions[-1, :2] for plan in plans])
+    assert pdist(ends).max() > 0.1, "one target alone"
+    assert (np.abs(ends) < 0.6).all()
+
+
 def test_weights_are_kept_with_their_shape(tmp_path: Path, shown: list[Demonstration]) -> None:
     policy = make_untrained()
     policy._network.half().float()

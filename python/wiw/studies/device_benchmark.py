@@ -138,8 +138,7 @@ def benchmark_device(
     peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 2**10
     notes = [
         f"Peak memory of this process: {peak:.0f} MB; load {os.getloadavg()[0]:.1f} at the end.",
-        "A training step is a forward pass, the mean square of its outputs, the backward pass and AdamW. The diffuser "
-        "has random weights, as none are shipped.",
+        "A training step is a forward pass, the mean square of its outputs, the backward pass and AdamW.",
     ]
     return DeviceBenchmark(devices, describe_platform(), found, not_run, notes)
 

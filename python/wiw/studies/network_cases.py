@@ -205,9 +205,10 @@ PATHS, STEPS = 16, 20
 
 
 def _make_diffuser() -> nn.Module:
-    from wiw.policies.diffuser.network import Network
+    from wiw.policies.diffuser import BUILT_IN
+    from wiw.policies.diffuser.weights import load
 
-    return Network()
+    return load(BUILT_IN)[0]
 
 
 def _draw_diffuser(network: Any, batch: int) -> Inputs:
@@ -222,7 +223,8 @@ def _draw_diffuser(network: Any, batch: int) -> Inputs:
 def _encode_scene(network: Any, image: Tensor, height: Tensor, places: Tensor, now: Tensor) -> Any:
     from wiw.policies.diffuser.network import Views
 
-    return network.encode_scene([Views(image, height, places)], now)
+    cameras = 2 if network.shape.wrist else 1
+    return network.encode_scene([Views(image, height, places)] * cameras, now)
 
 
 def _denoise(network: Any, *inputs: Any) -> Any:

@@ -27,6 +27,7 @@ if TYPE_CHECKING:
     from wiw.policies.diffuser.network import Network
 
 
+BUILT_IN = Path(__file__).with_name("weights.safetensors")
 STEPS = 20
 """Denoising steps."""
 
@@ -41,7 +42,7 @@ class Diffuser(Policy):
     Where fewer poses are requested, a path is thinned to those that its shape needs.
 
     Args:
-        weights: a file of `wiw train diffuser`.
+        weights: a file of `wiw train diffuser`; None means those that come with wiw.
         steps: number of denoising steps, up to 100.
 
     Raises:
@@ -54,16 +55,17 @@ class Diffuser(Policy):
     needs: tuple[str, ...] = ("depth",)
     default_revision = "scripted"
 
-    def __init__(self, weights: str | Path, steps: int = STEPS) -> None:
+    def __init__(self, weights: str | Path | None = None, steps: int = STEPS) -> None:
         if not 1 <= steps <= 100:
             raise ArgumentError(f"diffuser: expected 1 to 100 steps, got {steps}")
         require_torch()
         from wiw.policies.diffuser.weights import load
 
         self.steps = steps
-        self._network, self.card = load(weights)
+        file = BUILT_IN if weights is None else Path(weights).expanduser()
+        self._network, self.card = load(file)
         self.needs = choose_needs(self._network)
-        self._digest = blake2b(Path(weights).expanduser().read_bytes(), digest_size=8).hexdigest()
+        self._digest = blake2b(file.read_bytes(), digest_size=8).hexdigest()
 
     @classmethod
     def from_network(cls, network: Network, steps: int = STEPS) -> Diffuser:
