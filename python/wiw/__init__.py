@@ -83,7 +83,7 @@ _HOME = {
     "compare": "wiw.studies.compare",
     "data_scaling": "wiw.studies.data_scaling",
     "evaluate": "wiw.studies.evaluate",
-    "import_prompts": "wiw.policies.vlm.prompt_import",
+    "import_prompts": "wiw.policies.vlm.prompt_import.importer",
     "judge": "wiw.studies.judge",
     "load_run": "wiw.studies.run_log",
     "make": "wiw.registry",
@@ -149,7 +149,7 @@ if TYPE_CHECKING:
     from wiw.loop.agent import Agent
     from wiw.metrics.metric import Metric
     from wiw.policies.base import Policy
-    from wiw.policies.vlm.prompt_import import import_prompts
+    from wiw.policies.vlm.prompt_import.importer import import_prompts
     from wiw.runs.merge import merge
     from wiw.runs.status import status
     from wiw.runs.verify import verify

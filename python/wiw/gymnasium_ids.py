@@ -14,9 +14,14 @@ from types import ModuleType
 from typing import Any
 
 NAMESPACE = "wiw"
-TASKS = {"ImageNav-v0": "imagenav", "AR-v0": "ar", "AEQA-v0": "aeqa", "Manipulation-v0": "manipulation"}
-"""Task names by gymnasium id."""
 _REGISTRY = "gymnasium.envs"
+
+
+def list_ids() -> dict[str, str]:
+    """Return the names of the built-in tasks by gymnasium's: "ImageNav-v0", after its class, is "imagenav"."""
+    from wiw.registry import TASKS
+
+    return {f"{place.rpartition(':')[2]}-v0": name for name, place in TASKS.built_in.items()}
 
 
 def register_environments() -> None:
@@ -51,7 +56,7 @@ class _AfterGymnasium(MetaPathFinder):
 def _register() -> None:
     from gymnasium.envs.registration import register, registry
 
-    for name, task in TASKS.items():
+    for name, task in list_ids().items():
         if f"{NAMESPACE}/{name}" not in registry:
             register(
                 f"{NAMESPACE}/{name}",

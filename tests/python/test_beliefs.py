@@ -268,7 +268,7 @@ def log(episode, tmp_path_factory):  # noqa: F811
     """A short episode of the explorer, with an answer that the page must not take for markup."""
     info = {**episode.info, "question": {**episode.info["question"], "extra_answers": ["<b>navy</b>"]}}
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr("wiw.policies.explorer.name_color", lambda pixels, category: ("blue", 0.8))
+        patch.setattr("wiw.policies.explorer.policy.name_color", lambda pixels, category: ("blue", 0.8))
         task = make_task(replace(episode, info=info), actions=45)
         agents = {"none": wiw.Agent(make_explorer(), **task.defaults)}
         out = tmp_path_factory.mktemp("beliefs") / "run"

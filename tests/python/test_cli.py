@@ -17,7 +17,7 @@ from wiw.cli.flag_help import read_flags
 from wiw.cli.options import parse_options
 from wiw.cli.parts import AgentFlags
 from wiw.errors import ArgumentError
-from wiw.scenes import scans
+from wiw.scenes.scans import formats
 from wiw.studies.run_log import load_run
 from wiw.tasks.imagenav import ImageNav
 
@@ -59,7 +59,7 @@ def test_help_names_every_kind_of_scans(command, capsys):
     with pytest.raises(SystemExit):
         main([*command, "--help"])
     printed = capsys.readouterr().out
-    assert [kind for kind in scans.KINDS if f"{kind}:DIR" not in printed] == []
+    assert [kind for kind in formats.KINDS if f"{kind}:DIR" not in printed] == []
 
 
 def test_no_command_shows_help_and_a_wrong_one_is_refused(capsys):

@@ -18,8 +18,8 @@ from recognition_file import a_file
 from wiw.cli import main
 from wiw.errors import ArgumentError, PromptError
 from wiw.policies.vlm.prompt_images import resize_view
-from wiw.policies.vlm.prompt_import import CARD, write_templates
-from wiw.policies.vlm.prompts import Prompts
+from wiw.policies.vlm.prompt_import.importer import CARD, write_templates
+from wiw.policies.vlm.prompts.templates import Prompts
 from wiw.registry import POLICIES, WORLD_MODELS, task_class
 from wiw.runs.compose import RunContext
 from wiw.runs.departures import EPISODES, find_departures

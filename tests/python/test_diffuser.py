@@ -35,10 +35,10 @@ from wiw.types import ArmObservation, CameraView, Goal, Key
 
 torch = pytest.importorskip("torch", reason="needs wiw[torch]")
 
-from wiw.policies.diffuser import Diffuser  # noqa: E402
 from wiw.policies.diffuser.attention import LONGEST_WAVE, OFFSET_UNIT, SHORTEST_WAVE, RelativeAttention  # noqa: E402
 from wiw.policies.diffuser.diffusion import ALPHA_BARS, NOISE_LEVELS, add_noise, sample_ddim  # noqa: E402
 from wiw.policies.diffuser.network import EncodedScene, Network, Shape  # noqa: E402
+from wiw.policies.diffuser.policy import Diffuser  # noqa: E402
 from wiw.policies.diffuser.weights import load, save  # noqa: E402
 from wiw.training.checkpoint import Checkpoint  # noqa: E402
 from wiw.training.diffuser import Augmentation, Recipe, Samples, extract_samples, train  # noqa: E402

@@ -34,10 +34,10 @@ from wiw.mapping.fragments import pack_voxels
 from wiw.mapping.object_map import MapObject, ObjectMap
 from wiw.mapping.occupancy import OccupancyGrid
 from wiw.perception.scene_labels import CATEGORIES, STATES, Labeller, SceneLabels
-from wiw.policies import explorer
 from wiw.policies.explorer import confidence
 from wiw.policies.explorer.answering import answer, list_wanted
 from wiw.policies.explorer.home import KNOWLEDGE, Home, believe_home, load_knowledge, to_table_frame
+from wiw.policies.explorer.policy import Explorer
 from wiw.policies.explorer.presuming import find_likeliest
 from wiw.runs.recipes import AgentRecipe, TaskRecipe
 from wiw.scenes import apartment_table
@@ -70,7 +70,7 @@ def plain_colors(monkeypatch: pytest.MonkeyPatch) -> None:
     def name_color(pixels: np.ndarray, category: str) -> tuple[str, float]:
         return names[int(((values - pixels.mean(axis=0)) ** 2).sum(axis=1).argmin())], 0.8
 
-    monkeypatch.setattr(explorer, "name_color", name_color)
+    monkeypatch.setattr("wiw.policies.explorer.policy.name_color", name_color)
 
 
 def make_explorer(**options: Any) -> OracleExplorer:
@@ -325,7 +325,7 @@ def test_true_perception_is_told_apart():
     with pytest.raises(ArgumentError, match="explorer-oracle"):
         wiw.policy("explorer", perception=wiw.registry.LABELLERS.make("oracle", instances=[]))
     with pytest.raises(ArgumentError, match="use it with task aeqa"):
-        explorer.Explorer.require({"task": "imagenav"})
+        Explorer.require({"task": "imagenav"})
 
 
 def test_queries_carry_the_text_alone(episode):  # noqa: F811

@@ -24,7 +24,7 @@ from wiw.loop.imagination import ModelInput, Request
 from wiw.loop.plan_space import plan_space
 from wiw.loop.rollout_cache import Cached, RolloutCache
 from wiw.policies.base import FrameSpec, Policy
-from wiw.policies.matcher import SOURCE, Matcher
+from wiw.policies.matcher.policy import SOURCE, Matcher
 from wiw.runs.merge import merge
 from wiw.runs.store import RunStore
 from wiw.runs.store_file import store_path

@@ -15,12 +15,12 @@ from wiw.action import FORWARD, TURN_LEFT
 from wiw.cli import main
 from wiw.datasets.questions.facts import STRUCTURE
 from wiw.errors import ArgumentError, RolloutError
-from wiw.experiments.errors import ERRORS, make_error
 from wiw.experiments.errors.content import list_barriers, list_things
 from wiw.experiments.errors.control import MotionDegradation, list_moves
 from wiw.experiments.errors.drawing import paste_copies
 from wiw.experiments.errors.erroneous import Erroneous
 from wiw.experiments.errors.forks import Walker, WorldFork
+from wiw.experiments.errors.kinds import ERRORS, make_error
 from wiw.experiments.errors.looks import FrameDegradation
 from wiw.experiments.fidelity import FidelityObserver
 from wiw.loop.attempts import Attempted

@@ -12,7 +12,7 @@ from gymnasium.utils.env_checker import check_env
 
 import wiw
 from wiw.errors import ArgumentError
-from wiw.gymnasium_ids import NAMESPACE, TASKS
+from wiw.gymnasium_ids import NAMESPACE, list_ids
 
 
 @pytest.mark.parametrize("imports", ["import wiw, gymnasium", "import gymnasium, wiw", "import wiw, gymnasium.spaces"])
@@ -30,8 +30,10 @@ def test_importing_wiw_leaves_gymnasium_alone() -> None:
 
 
 def test_every_task_is_there() -> None:
-    assert set(TASKS.values()) == set(wiw.registry.TASKS.built_in)
-    assert {f"{NAMESPACE}/{name}" for name in TASKS} <= set(gymnasium.registry)
+    ids = {"ImageNav-v0": "imagenav", "AR-v0": "ar", "AEQA-v0": "aeqa", "Manipulation-v0": "manipulation"}
+    assert list_ids() == ids and {*ids.values()} == {*wiw.registry.TASKS.built_in}
+    assert {f"{NAMESPACE}/{name}" for name in ids} <= set(gymnasium.registry)
+    assert {name: wiw.registry.task_name(name) for name in ids} == ids
 
 
 def test_gymnasium_makes_what_wiw_makes(two_rooms: str) -> None:

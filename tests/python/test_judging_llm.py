@@ -17,7 +17,7 @@ from misbehaviour import MisbehavingVlmServer, Misbehaviour
 from wiw.errors import ArgumentError, InfrastructureError, JudgeError, PromptError, VlmError
 from wiw.judging import LanguageModelJudge, Reference, TieredJudge, make_judge
 from wiw.judging.llm import parse_mark
-from wiw.judging.prompts import FOLDER, NAME, SLOTS, JudgePrompt
+from wiw.judging.prompts.judge_prompt import FOLDER, NAME, SLOTS, JudgePrompt
 from wiw.serving.vlm_server import VlmServer
 from wiw.vlm.messages import Call, Completion
 from wiw.vlm.mock import MockClient

@@ -162,6 +162,16 @@ def test_no_files_import_each_other_in_a_circle() -> None:
     assert STRUCTURE.circles(file_edges()) == []
 
 
+def test_packages_have_their_code_in_modules() -> None:
+    """An `__init__.py` holds a docstring and re-exports at most; some are lazy (`__getattr__`)."""
+    package, found = ROOT / "python/wiw", set()
+    for file in package.rglob("__init__.py"):
+        for node in ast.parse(file.read_text()).body:
+            if isinstance(node, ast.FunctionDef | ast.ClassDef) and not node.name.startswith("__"):
+                found.add(str(file.parent.relative_to(package)))
+    assert not found
+
+
 @pytest.mark.parametrize(
     ("argument", "code", "said"), [("--help", 0, "usage: "), ("no/such/folder", 2, "expected a checkout of wiw")]
 )

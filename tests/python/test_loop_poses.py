@@ -319,6 +319,14 @@ def test_a_shuffled_placebo_of_poses_is_refused() -> None:
         agent.decide(observation, env.goal, Key(0, 0))
 
 
+def test_a_task_without_a_wrist_camera_refuses_a_policy_that_needs_one() -> None:
+    class ByWrist(Reacher):
+        needs = ("wrist",)
+
+    with pytest.raises(ArgumentError, match="task 'dot' does not have"):
+        wiw.evaluate(DotTask(), wiw.Agent(ByWrist()), 1, progress=False)
+
+
 def test_plans_of_poses_are_judged_by_the_truth() -> None:
     """`TrueScores` asks the guide of the live environment for poses as it does for primitives."""
 

@@ -15,7 +15,6 @@ from numpy.typing import NDArray
 from wiw.errors import ArgumentError
 from wiw.mapping.fragments import VOXEL, cut_depth_steps, pack_voxels, split_voxels, unpack_voxels
 from wiw.mapping.object_map import ObjectMap
-from wiw.mapping.relations import find_around, find_support, hangs_above, is_beside, measure_gap, share_room
 from wiw.mapping.views import (
     HFOV_DEG,
     SIZE,
@@ -263,53 +262,7 @@ def test_wrong_labels_are_refused() -> None:
         ObjectMap(("chair", "table"))
 
 
-# -- relations ---------------------------------------------------------------------------------------------------------
-
-SMALL = frozenset({"bowl", "vase", "plant pot", "box", "candles", "books", "bottle", "cup", "table lamp", "microwave"})
-
-
-def test_small_things_stand_on_what_the_table_says() -> None:
-    """The scene's own: the furniture under the middle of a thing whose top is nearest to the thing's foot."""
-    known = mapped()
-    things = known.shown(400)
-    furniture = [known_ for known_ in known.objects.objects if known_.category not in SMALL | {"rug", "picture"}]
-    right = total = 0
-    for thing in things:
-        found = known.matches(thing)
-        if thing.category not in SMALL or len(found) != 1:
-            continue
-        under = [
-            other
-            for other in known.tour.things()
-            if other.category not in SMALL | {"floor", "ceiling", "wall", "rug", "pendant lamp", "ceiling lamp"}
-            and other.room == thing.room
-            and (thing.center[:2] >= other.low[:2]).all()
-            and (thing.center[:2] <= other.high[:2]).all()
-            and other.low[2] - 0.03 <= thing.low[2] <= other.high[2] + 0.05
-        ]
-        if under:
-            expected = min(under, key=lambda other: abs(other.high[2] - thing.low[2])).category
-            support = find_support(found[0], furniture)
-            total += 1
-            right += support is not None and support.category == expected
-    assert total >= 10 and right / total >= 0.8
-
-
-def test_relations_of_plain_shapes() -> None:
-    objects = ObjectMap(NAMES)
-    views, category = blank_views(), np.zeros((4, *SIZE), np.uint8)
-    add_square(views, category, 5, (2.0, 0.0, 0.4), 0.35)  # a table
-    add_square(views, category, 3, (2.0, 0.2, 0.83), 0.07)  # a cup on it
-    add_square(views, category, 2, (2.0, 0.9, 0.4), 0.25)  # a chair beside it
-    add_square(views, category, 4, (2.0, 0.0, 1.5), 0.15)  # a vase hung above
-    objects.add(views, labels_of(category))
-    table, chair, vase, cup = (objects.find(name)[0] for name in ("table", "chair", "vase", "cup"))
-    assert find_support(cup, objects.objects) is table and find_support(vase, objects.objects) is None
-    assert hangs_above(vase, table) and not hangs_above(cup, table) and not hangs_above(vase, chair)
-    assert is_beside(chair, table) and not is_beside(cup, table) and not is_beside(vase, table)
-    assert measure_gap(chair, table) == pytest.approx(0.3, abs=0.08)
-    assert find_around([chair, vase], table) == [chair, vase] and find_around([chair], table, 0.1) == []
-    assert list(objects.group_by_category()) == ["chair", "cup", "table", "vase"]
+# -- rooms -----------------------------------------------------------------------------------------------------------
 
 
 def test_rooms_of_things_are_those_of_the_table() -> None:
@@ -318,10 +271,11 @@ def test_rooms_of_things_are_those_of_the_table() -> None:
     pairs = [
         (thing, found) for thing, found in pairs if thing.room and thing.category not in ("door", "passage", "window")
     ]
+    rooms = [(thing.room, known.grid.find_room(found.points)) for thing, found in pairs]
     agree = [
-        share_room(a, b, known.grid) == (one.room == other.room)
-        for i, (one, a) in enumerate(pairs)
-        for other, b in pairs[i + 1 :]
+        (own == another != 0) == (true == other)
+        for i, (true, own) in enumerate(rooms)
+        for other, another in rooms[i + 1 :]
     ]
     assert len(agree) > 500 and np.mean(agree) > 0.95
 

@@ -182,7 +182,7 @@ def test_what_is_written_is_read(
     schema = navigation_schema(depth, {"name": "ü"})
     write_frames(path, schema, (build_table(each, schema) for each in written))
     file = FrameFile(path)
-    assert file.row_counts == lengths and file.facts["name"] == "ü"
+    assert len(file) == len(lengths) and file.facts["name"] == "ü"
     for index, each in enumerate(written):
         for name, value in vars(each).items():
             np.testing.assert_equal(getattr(file.read_segment(index), name), value)

@@ -25,8 +25,8 @@ from wiw.training.traversal import (
     HEADINGS,
     TURN_RAD,
     Follower,
-    Segment,
     Traversal,
+    TraversalSegment,
     choose_islands,
     find_point_ahead,
     measure_coverage,
@@ -97,7 +97,7 @@ def test_a_traversal_is_one_walk_on_one_island(pieces: Any, seed: int, rules: Na
     navmesh = NavMesh.build(room(pieces))
     for traversal in plan_scene(navmesh, "room", seed, 0, rules):
         assert traversal.frames <= rules.max_scene_frames
-        before: Segment | None = None
+        before: TraversalSegment | None = None
         for segment in traversal.segments:
             assert navmesh.is_navigable(segment.positions).all()
             assert (navmesh.island_of(segment.positions) == traversal.island).all()
@@ -111,7 +111,7 @@ def test_a_traversal_is_one_walk_on_one_island(pieces: Any, seed: int, rules: Na
             before = segment
 
 
-def check_motion(segment: Segment) -> None:
+def check_motion(segment: TraversalSegment) -> None:
     """Turns turn on the spot by one heading; steps keep the heading and go at most 0.2 m and a cell's rounding."""
     moved = np.linalg.norm(np.diff(segment.positions[:, [0, 2]], axis=0), axis=1)
     turned = (np.diff(segment.headings) + HEADINGS // 2) % HEADINGS - HEADINGS // 2
@@ -298,7 +298,7 @@ def test_coverage_is_the_share_of_the_floor_near_the_path() -> None:
     navmesh = NavMesh.build(room([]))
     samples = navmesh.sample(4000, 0, 0)
     at = navmesh.snap(np.array([[3.5, 0, 2.5]], np.float32))
-    segment = Segment(at, np.zeros(1, np.int64), np.zeros(1, np.int8), at[0], "reached")
+    segment = TraversalSegment(at, np.zeros(1, np.int64), np.zeros(1, np.int8), at[0], "reached")
     disc = np.pi / navmesh.islands[0].area
     assert measure_coverage(navmesh, samples, [segment]) == pytest.approx(disc, rel=0.15)
     assert measure_coverage(navmesh, samples, []) == 0

@@ -23,7 +23,6 @@ from wiw.types import Goal, Key, Observation, Rollout
 
 torch = pytest.importorskip("torch", reason="needs wiw[torch]")
 
-from wiw.policies.navigator import Memory, Navigator  # noqa: E402
 from wiw.policies.navigator.bands import get_goal_mask, project_goal  # noqa: E402
 from wiw.policies.navigator.belief import (  # noqa: E402
     VISITED,
@@ -42,6 +41,7 @@ from wiw.policies.navigator.candidates import (  # noqa: E402
     measure_arrivals,
 )
 from wiw.policies.navigator.network import CENTRES, Network, to_input  # noqa: E402
+from wiw.policies.navigator.policy import Memory, Navigator  # noqa: E402
 from wiw.policies.navigator.way_cells import WayCells  # noqa: E402
 from wiw.policies.navigator.ways import UNKNOWN_COST, WayMap  # noqa: E402
 from wiw.policies.navigator.weights import load, save  # noqa: E402

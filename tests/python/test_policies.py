@@ -15,7 +15,8 @@ import wiw
 from wiw.action import FORWARD, TURN_LEFT, TURN_RIGHT
 from wiw.policies.base import Situation
 from wiw.policies.heuristic import INVERSE
-from wiw.policies.matcher import (
+from wiw.policies.matcher.exploration import CELL, FAR_DISTANCE, ExplorationMap, to_cells
+from wiw.policies.matcher.policy import (
     HEADINGS,
     STEP,
     Matcher,
@@ -27,7 +28,6 @@ from wiw.policies.matcher import (
     predict_positions,
     recall_gains,
 )
-from wiw.policies.matcher.exploration import CELL, FAR_DISTANCE, ExplorationMap, to_cells
 from wiw.types import Goal, Key, Observation, Proposal, Rollout
 
 BLANK = Observation(np.zeros((576, 1024, 3), np.uint8), np.zeros((480, 480, 3), np.uint8), np.zeros(3))

@@ -16,7 +16,7 @@ from wiw.cli import main
 from wiw.errors import FileError, PromptError
 from wiw.policies.vlm.prompt_import.latex import convert_latex
 from wiw.policies.vlm.prompt_import.sources import name_template, read_source
-from wiw.policies.vlm.prompts import FOLDER, SETS, Prompts, get_slots, list_tasks
+from wiw.policies.vlm.prompts.templates import FOLDER, SETS, Prompts, get_slots, list_tasks
 from wiw.vlm.template_worker import ENVIRONMENT
 
 BOX = "\\begin{tcolorbox}[\n  breakable,\n  title=%s,\n  colback=red!5\n]\n%s\n\\end{tcolorbox}\n"

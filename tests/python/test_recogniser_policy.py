@@ -120,7 +120,7 @@ def weights(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 def policy(weights: Path, **options: Any) -> Any:
-    from wiw.policies.recogniser import Recognition
+    from wiw.policies.recogniser.policy import Recognition
 
     return Recognition(weights, **options)
 
@@ -201,7 +201,7 @@ def test_turns_and_the_order_of_steering_cost_a_plan(two_rooms: str, tmp_path: P
 
 def test_weights_that_come_with_the_package_are_small_and_calibrated() -> None:
     from wiw.perception.recogniser import Recogniser
-    from wiw.policies.recogniser import WEIGHTS
+    from wiw.policies.recogniser.policy import WEIGHTS
 
     recogniser = Recogniser.load(WEIGHTS)
     assert WEIGHTS.stat().st_size < 2 * 2**20
@@ -212,7 +212,7 @@ def test_weights_that_come_with_the_package_are_small_and_calibrated() -> None:
 @pytest.mark.nightly
 def test_weights_that_come_with_the_package_know_things_of_unseen_homes() -> None:
     from wiw.perception.recogniser import Recogniser
-    from wiw.policies.recogniser import WEIGHTS
+    from wiw.policies.recogniser.policy import WEIGHTS
     from wiw.training.glimpse_sets import START, GlimpseSetRules, collect_glimpse_sets
 
     recogniser = Recogniser.load(WEIGHTS)
@@ -245,9 +245,9 @@ def test_front_views_are_looked_at_too(two_rooms: str, tmp_path: Path, weights: 
 def test_a_policy_that_only_proposes_is_revised_by_it(
     two_rooms: str, tmp_path: Path, weights: Path, monkeypatch: pytest.MonkeyPatch, model: Any
 ) -> None:
-    from wiw.policies.recogniser import Recognition
+    from wiw.policies.recogniser.policy import Recognition
 
-    monkeypatch.setattr("wiw.policies.recogniser.WEIGHTS", weights)
+    monkeypatch.setattr("wiw.policies.recogniser.policy.WEIGHTS", weights)
     task = AR(episode_file=a_file(tmp_path, two_rooms), decisions=2)
     agent = wiw.Agent("heuristic", model)
     assert isinstance(agent_for(task, agent).reviser, Recognition)

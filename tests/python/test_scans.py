@@ -52,7 +52,7 @@ def fine() -> None:
 @pytest.fixture
 def in_process(monkeypatch: pytest.MonkeyPatch) -> None:
     """Reads scenes without a child, which takes a second to start, and without the cache."""
-    monkeypatch.setattr(scenes, "load", partial(scenes.load, cache=False, isolate=False))
+    monkeypatch.setattr("wiw.scenes.opening.load", partial(scenes.load, cache=False, isolate=False))
 
 
 def load(path: Path, **options: Any) -> scenes.Scene:

@@ -13,7 +13,7 @@ import pytest
 from wiw.analysis.errors import METRES, summarise_errors
 from wiw.cli import main
 from wiw.errors import ArgumentError, StoreError
-from wiw.experiments.errors import ERRORS
+from wiw.experiments.errors.kinds import ERRORS
 from wiw.report.error_page import write_errors
 from wiw.report.error_tables import explain, print_errors
 from wiw.studies.errors import ErrorSettings, make_recipes, read_errors, study_errors

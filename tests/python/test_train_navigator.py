@@ -16,7 +16,7 @@ from wiw.errors import ArgumentError
 
 torch = pytest.importorskip("torch", reason="needs wiw[torch]")
 
-from wiw.policies.navigator import Navigator  # noqa: E402
+from wiw.policies.navigator.policy import Navigator  # noqa: E402
 from wiw.training.checkpoint import Checkpoint  # noqa: E402
 from wiw.training.goal_places import GoalPlaces, PlaceRules, record_goal_places, require_places  # noqa: E402
 from wiw.training.navigator import Recipe, evaluate, measure_prior, sample_pairs, spread_bearings, train  # noqa: E402

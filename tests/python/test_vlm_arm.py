@@ -19,10 +19,11 @@ pytest.importorskip("json_repair")
 import wiw
 from misbehaviour import MisbehavingVlmServer, Misbehaviour
 from wiw.errors import ArgumentError, PromptError
-from wiw.policies.vlm import VLM
-from wiw.policies.vlm.arm import ArmVLM, plans, prompt_images
+from wiw.policies.vlm.arm import plans, prompt_images
 from wiw.policies.vlm.arm.plans import GRID
-from wiw.policies.vlm.prompts import ARM_SLOTS, Prompts
+from wiw.policies.vlm.arm.policy import ArmVLM
+from wiw.policies.vlm.policy import VLM
+from wiw.policies.vlm.prompts.templates import ARM_SLOTS, Prompts
 from wiw.runs.recipes import AgentRecipe
 from wiw.studies.evaluate import evaluate
 from wiw.tabletop.workbench import CAMERAS, TABLE

@@ -22,8 +22,9 @@ from recognition_file import a_file
 from wiw.cli import main
 from wiw.errors import ArgumentError, PromptError
 from wiw.loop.memory import Query
-from wiw.policies.vlm import VLM, presets, prompt_images
-from wiw.policies.vlm.prompts import FOLDER, SLOTS, Prompts
+from wiw.policies.vlm import presets, prompt_images
+from wiw.policies.vlm.policy import VLM
+from wiw.policies.vlm.prompts.templates import FOLDER, SLOTS, Prompts
 from wiw.runs.recipes import AgentRecipe
 from wiw.serving.vlm_server import VlmServer
 from wiw.studies.evaluate import evaluate

@@ -9,7 +9,7 @@ from pathlib import Path
 import pytest
 
 from wiw.errors import PromptError
-from wiw.policies.vlm.prompts import FOLDER, SLOTS, Prompts, get_slots, list_tasks
+from wiw.policies.vlm.prompts.templates import FOLDER, SLOTS, Prompts, get_slots, list_tasks
 
 LOOP = "{% for a in range(99999) %}"
 

@@ -36,8 +36,9 @@ from wiw.mapping.views import SIZE
 from wiw.perception.detection import Detections, Detector
 from wiw.perception.detector_labeller import DetectorLabeller
 from wiw.policies.vlm.make import make_vlm
-from wiw.policies.vlm.questions import QuestionVLM, commands, steering
+from wiw.policies.vlm.questions import commands, steering
 from wiw.policies.vlm.questions.home_map import HomeMap, find_named
+from wiw.policies.vlm.questions.policy import QuestionVLM
 from wiw.runs.recipes import AgentRecipe
 from wiw.serving.vlm_server import VlmServer
 from wiw.tasks import presets

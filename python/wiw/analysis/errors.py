@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 from wiw.analysis.rank_correlation import Correlation, correlate
 from wiw.analysis.statistics import Difference, Estimate, adjust_p_values, compare, estimate_difference, estimate_mean
 from wiw.analysis.summary import split_outcomes
-from wiw.experiments.errors import ERRORS
+from wiw.experiments.errors.kinds import ERRORS
 from wiw.metrics.metric import ANSWER_SCORE, MEAN_TRAJECTORY, SUCCESS, Metric
 
 REGRET = Metric("regret", "Regret", "length", False, least=0.0)

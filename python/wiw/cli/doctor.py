@@ -3,7 +3,6 @@
 
 from __future__ import annotations
 
-import importlib.metadata
 import importlib.util
 import os
 import platform
@@ -58,14 +57,15 @@ def examine() -> Iterator[Finding]:
 
 def _check_software() -> Iterator[Finding]:
     import wiw
+    from wiw.runs.platform import find_version
 
     yield Finding("wiw", f"{wiw.__version__} in {Path(wiw.__file__).parent}")
     old = tuple(map(int, platform.python_version_tuple()[:2])) < (3, 10)
     yield Finding("python", platform.python_version(), "wiw needs Python 3.10 or newer" if old else "")
     names = ("numpy", "scipy", "opencv-python-headless", "gymnasium", "matplotlib", "jinja2", "rich", "tyro")
-    missing = [name for name in names if not _find_version(name)]
+    missing = [name for name in names if not find_version(name)]
     remedy = f"pip install {' '.join(missing)}" if missing else ""
-    yield Finding("packages", ", ".join(f"{name} {_find_version(name) or 'missing'}" for name in names), remedy)
+    yield Finding("packages", ", ".join(f"{name} {find_version(name) or 'missing'}" for name in names), remedy)
 
 
 def _check_processor() -> Iterator[Finding]:
@@ -116,9 +116,11 @@ def _check_rendering() -> Iterator[Finding]:
 
 def _check_torch() -> Finding:
     """Return whether torch is installed, without importing it, which takes seconds."""
+    from wiw.runs.platform import find_version
+
     if importlib.util.find_spec("torch") is None:
         return Finding("torch", "not installed; only learned world models need it (pip install 'wiw[torch]')")
-    return Finding("torch", _find_version("torch") or "of unknown version")
+    return Finding("torch", find_version("torch") or "of unknown version")
 
 
 def _check_writable(name: str, folder: Path) -> Finding:
@@ -148,10 +150,3 @@ def _cache() -> Finding:
 def _count_free_gigabytes(folder: Path) -> float:
     disk = os.statvfs(folder)
     return disk.f_bavail * disk.f_frsize / 2**30
-
-
-def _find_version(package: str) -> str | None:
-    try:
-        return importlib.metadata.version(package)
-    except importlib.metadata.PackageNotFoundError:
-        return None

@@ -114,7 +114,7 @@ def _add_presets(table: Any, detailed: bool = False) -> None:
 
 
 def _add_errors(table: Any) -> None:
-    from wiw.experiments.errors import ERRORS
+    from wiw.experiments.errors.kinds import ERRORS
 
     table.add_row("[bold]Errors of futures[/]", "[dim]--arms error-KIND@DOSE[:MODEL]; by default of the oracle[/]")
     for name, kind in ERRORS.items():
@@ -152,7 +152,7 @@ def _add_vlm_models(table: Any) -> None:
 
 
 def _add_prompts(table: Any) -> None:
-    from wiw.policies.vlm.prompts import SETS, Prompts
+    from wiw.policies.vlm.prompts.templates import SETS, Prompts
 
     table.add_row(
         "[bold]Prompts of policy vlm[/]", "[dim]--prompts NAME, or a folder written by `wiw prompts import`[/]"

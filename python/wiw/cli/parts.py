@@ -156,7 +156,7 @@ class AgentFlags:
 
 def _make_absolute(name: str, value: Any) -> str:
     """Return an option of policy vlm, made absolute if it is a path."""
-    from wiw.policies.vlm.prompts import SETS
+    from wiw.policies.vlm.prompts.templates import SETS
 
     is_path = isinstance(value, Path) or (name == "prompts" and value not in SETS)
     return str(Path(value).expanduser().resolve()) if is_path else str(value)

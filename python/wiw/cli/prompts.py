@@ -29,7 +29,7 @@ def import_prompts(
         source: The paper's LaTeX source (a file or a folder), or a checkout of its published code.
         out: Folder to write, new or empty.
     """
-    from wiw.policies.vlm.prompt_import import import_prompts
+    from wiw.policies.vlm.prompt_import.importer import import_prompts
 
     done = import_prompts(source, out)
     for name, place in done.imported.items():

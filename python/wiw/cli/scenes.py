@@ -82,7 +82,7 @@ def verify_scans(
     from wiw.cli.terminal import printable
     from wiw.datasets.scan_check import check_scan
     from wiw.datasets.scene_splits import name_scene
-    from wiw.scenes.scans import find_all, find_scans, parse_spec
+    from wiw.scenes.scans.formats import find_all, find_scans, parse_spec
 
     spec = parse_spec(folder)
     files = find_scans(*spec) if spec else find_all(Path(folder))

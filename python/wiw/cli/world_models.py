@@ -63,7 +63,7 @@ def _indent(text: Any) -> Any:
 
 def _make_row(name: str) -> _Row:
     """Return the row of a registered model, with dashes for what is known only once it is built."""
-    from wiw.world_models.base import Accepts
+    from wiw.world_models.base import find_accepts
     from wiw.world_models.status import lacks
 
     dashes = (name, *"-" * (len(HEADS) - 1))
@@ -71,11 +71,11 @@ def _make_row(name: str) -> _Row:
         model = WORLD_MODELS.find(name)
     except Exception as error:  # a broken plugin must not hide the others
         return _Row(dashes, status=str(error), style="red")
-    declared, requires = getattr(model, "accepts", None), getattr(model, "requires", None)
+    declared, requires = find_accepts(model), getattr(model, "requires", None)
     lacking = lacks(requires) if requires else []
     status = f"needs {', '.join(lacking)}" if lacking else "ready"
     style = "yellow" if lacking else "green"
-    if not isinstance(declared, Accepts):
+    if declared is None:
         return _Row(dashes, status=status, style=style)
     height, width = declared.size
     takes = " + ".join((declared.view, *declared.needs))

@@ -9,7 +9,6 @@ from typing import Any
 from wiw.datasets.navigation_files import COLUMNS
 
 SIZES = ((10**3, "n<1K"), (10**4, "1K<n<10K"), (10**5, "10K<n<100K"), (10**6, "100K<n<1M"), (10**7, "1M<n<10M"))
-TURN_DEG = 22.5
 
 
 def build_card(meta: Mapping[str, Any]) -> str:

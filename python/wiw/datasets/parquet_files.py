@@ -124,11 +124,6 @@ class RowGroupFile:
     def __len__(self) -> int:
         return int(self._metadata.num_row_groups)
 
-    @property
-    def row_counts(self) -> list[int]:
-        """Rows of each row group."""
-        return [self._metadata.row_group(index).num_rows for index in range(len(self))]
-
     def read(self, index: int, columns: Sequence[str] | None = None) -> Any:
         """Return a row group as an Arrow table; nothing else of the file is read.
 

@@ -10,7 +10,7 @@ from pathlib import Path
 from wiw.datasets.worlds import navmesh_file, open_navmesh
 from wiw.errors import Error
 from wiw.scenes import MOST_MISSING, Scene, load
-from wiw.scenes.scans import compare_tables
+from wiw.scenes.scans.formats import compare_tables
 
 
 @dataclass

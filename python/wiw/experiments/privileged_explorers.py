@@ -23,9 +23,9 @@ from wiw.perception.colors import COLORS
 from wiw.perception.oracle_labeller import OracleLabeller
 from wiw.perception.scene_labels import SceneLabels
 from wiw.policies.base import Situation
-from wiw.policies.explorer import Explorer
 from wiw.policies.explorer.drawing import VIEW_SIZE
 from wiw.policies.explorer.memory import Look
+from wiw.policies.explorer.policy import Explorer
 
 SPACING = 1.2
 """Distance in metres within which a tour passes every reachable place."""

@@ -25,7 +25,15 @@ from wiw.isolation.source import Isolated, Source, build_signature, describe_cla
 from wiw.json_text import parse_json
 from wiw.registry import WORLD_MODELS
 from wiw.types import Conditioning, Control
-from wiw.world_models.base import Accepts, Requirements, WorldModel, answer_deadline, require_frames, seconds_left
+from wiw.world_models.base import (
+    Accepts,
+    Requirements,
+    WorldModel,
+    answer_deadline,
+    find_accepts,
+    require_frames,
+    seconds_left,
+)
 from wiw.world_models.remote.declaration import declaration, parse_declaration
 
 DOOR = {"isolate": (True, "bool"), "memory_gb": (None, "float | None")}
@@ -60,18 +68,20 @@ def find_isolated_model(name: str) -> type[IsolatedModel]:
 def _make_class(name: str, state: tuple[str, int, int] | None) -> type[IsolatedModel]:
     """Return the class of a name; an edited file has another one."""
     source = Source("world model", name, load_model)
-    told = source.told
+    described = source.description
     attributes: dict[str, Any] = {
         "source": source,
-        "version": told["version"],
-        "requires": Requirements(packages=tuple(told["packages"]), extra=told["extra"], weights=told["weights"]),
-        "__signature__": build_signature(told["parameters"], DOOR),
-        "__module__": told["module"],
-        "__doc__": told["doc"],
+        "version": described["version"],
+        "requires": Requirements(
+            packages=tuple(described["packages"]), extra=described["extra"], weights=described["weights"]
+        ),
+        "__signature__": build_signature(described["parameters"], DOOR),
+        "__module__": described["module"],
+        "__doc__": described["doc"],
     }
-    if told["accepts"]:
-        attributes["accepts"] = _Declared(parse_declaration(told["accepts"]))
-    return type(told["name"], (IsolatedModel,), attributes)
+    if described["accepts"]:
+        attributes["accepts"] = _Declared(parse_declaration(described["accepts"]))
+    return type(described["name"], (IsolatedModel,), attributes)
 
 
 class IsolatedModel(Isolated, WorldModel):
@@ -181,11 +191,11 @@ def load_model(host: Host, name: str) -> dict[str, Any]:
     """Import the class or factory behind a name; return its description, which is available before any call."""
     host.thing = thing = WORLD_MODELS.find_here(name)
     host.make = partial(WORLD_MODELS.make_here, name)
-    declared, requires = getattr(thing, "accepts", None), getattr(thing, "requires", Requirements())
+    declared, requires = find_accepts(thing), getattr(thing, "requires", Requirements())
     return {
         **describe_class(thing),
         "version": str(getattr(thing, "version", "")),
-        "accepts": declaration(declared) if isinstance(declared, Accepts) else "",
+        "accepts": declaration(declared) if declared else "",
         "packages": list(requires.packages),
         "extra": requires.extra,
         "weights": requires.weights,

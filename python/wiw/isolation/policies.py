@@ -45,15 +45,15 @@ def find_isolated_policy(name: str) -> type[IsolatedPolicy]:
 def _make_class(name: str, state: tuple[str, int, int] | None) -> type[IsolatedPolicy]:
     """Return the class of a name; an edited file has another one."""
     source = Source("policy", name, load_policy)
-    told = source.told
+    described = source.description
     attributes: dict[str, Any] = {
         "source": source,
-        "__signature__": build_signature(told["parameters"], DOOR),
-        "__module__": told["module"],
-        "__doc__": told["doc"],
-        **_read_declaration(told),
+        "__signature__": build_signature(described["parameters"], DOOR),
+        "__module__": described["module"],
+        "__doc__": described["doc"],
+        **_read_declaration(described),
     }
-    return type(told["name"], (IsolatedPolicy,), attributes)
+    return type(described["name"], (IsolatedPolicy,), attributes)
 
 
 class _MemoryHandle:
@@ -92,16 +92,16 @@ class IsolatedPolicy(Isolated, Policy):
     @property
     def can_revise(self) -> bool:
         """Whether the policy scores imagined futures itself."""
-        return bool(self._told["can_revise"])
+        return bool(self._declared["can_revise"])
 
     @property
     def can_extend(self) -> bool:
         """Whether the policy can propose from an imagined place."""
-        return bool(self._told["can_extend"])
+        return bool(self._declared["can_extend"])
 
     def describe(self) -> dict[str, Any]:
         """Return what the policy says of itself."""
-        described: dict[str, Any] = parse_json(self._told["described"])
+        described: dict[str, Any] = parse_json(self._declared["described"])
         return described
 
     def begin(self, goal: Goal, key: Key) -> Any:
@@ -147,20 +147,20 @@ class IsolatedPolicy(Isolated, Policy):
         rollouts: Sequence[Sequence[Rollout] | None],
     ) -> Sequence[Answer | TextAnswer | None]:
         """Return what the policy believes."""
-        if not self._told["answers"]:
+        if not self._declared["answers"]:
             return [None] * len(situations)
         return [_read_answer(each) for each in self._call(answer, _hide_memories(situations), proposals, rollouts)]
 
     def draw(self, situation: Situation, decision: Decision, north: float) -> Mapping[str, NDArray[np.uint8]]:
         """Return the policy's pictures, in which the heading at the start is up: the true north stays here."""
-        if not self._told["draws"]:
+        if not self._declared["draws"]:
             return {}
         found = self._call(draw, _hide_memories([situation])[0], replace(decision, key=None), 0.0)
         return {str(name): _read_array("draw", each) for name, each in found.items()}
 
     def exchanges(self, key: Key) -> tuple[Exchange, ...]:
         """Return the language model's exchanges of this decision."""
-        if not self._told["exchanges"]:
+        if not self._declared["exchanges"]:
             return ()
         return tuple(
             Exchange(**{**each, "said": tuple(each["said"])}) for each in json.loads(self._call(list_exchanges, key))
@@ -168,8 +168,8 @@ class IsolatedPolicy(Isolated, Policy):
 
     def _begin(self) -> None:
         """Make the policy in a process that has none."""
-        self._told: dict[str, Any] = self._make(make_policy, self._options, seconds=self._deadline)
-        for attribute, value in _read_declaration(self._told).items():
+        self._declared: dict[str, Any] = self._make(make_policy, self._options, seconds=self._deadline)
+        for attribute, value in _read_declaration(self._declared).items():
             setattr(self, attribute, value)
 
     def _call(self, function: Any, *arguments: Any) -> Any:
@@ -189,12 +189,12 @@ def _hide_memories(situations: Sequence[Situation]) -> list[Situation]:
     return [replace(each, memory=each.memory.number) for each in situations]
 
 
-def _read_declaration(told: Mapping[str, Any]) -> dict[str, Any]:
+def _read_declaration(declared: Mapping[str, Any]) -> dict[str, Any]:
     return {
-        "space": str(told["space"]),
-        "needs": tuple(map(str, told["needs"])),
-        "frames": _read_frames(**told["frames"]),
-        "default_revision": None if told["default_revision"] is None else str(told["default_revision"]),
+        "space": str(declared["space"]),
+        "needs": tuple(map(str, declared["needs"])),
+        "frames": _read_frames(**declared["frames"]),
+        "default_revision": None if declared["default_revision"] is None else str(declared["default_revision"]),
     }
 
 
@@ -202,26 +202,26 @@ def _read_frames(view: Any, size: Any, ends: Any, source_size: Any) -> FrameSpec
     return FrameSpec(str(view), _read_size(size), bool(ends), None if source_size is None else _read_size(source_size))
 
 
-def _read_size(told: Any) -> tuple[int, int]:
-    height, width = told
+def _read_size(packed: Any) -> tuple[int, int]:
+    height, width = packed
     return int(height), int(width)
 
 
-def _read_plans(told: Any) -> list[list[Proposal]]:
-    return [[Proposal(_read_array("propose", actions), *rest) for actions, *rest in own] for own in told]
+def _read_plans(packed: Any) -> list[list[Proposal]]:
+    return [[Proposal(_read_array("propose", actions), *rest) for actions, *rest in own] for own in packed]
 
 
-def _read_array(call: str, told: Any) -> NDArray[Any]:
-    return unpack_array(call, told).copy()
+def _read_array(call: str, packed: Any) -> NDArray[Any]:
+    return unpack_array(call, packed).copy()
 
 
-def _read_answer(told: Any) -> Answer | TextAnswer | None:
-    if told is None:
+def _read_answer(packed: Any) -> Answer | TextAnswer | None:
+    if packed is None:
         return None
-    if "text" in told:
-        return TextAnswer(str(told["text"]), float(told["confidence"]), bool(told["final"]))
-    raw = None if told["raw"] is None else _read_array("answer", told["raw"])
-    return Answer(tuple(map(str, told["choices"])), _read_array("answer", told["probabilities"]), raw)
+    if "text" in packed:
+        return TextAnswer(str(packed["text"]), float(packed["confidence"]), bool(packed["final"]))
+    raw = None if packed["raw"] is None else _read_array("answer", packed["raw"])
+    return Answer(tuple(map(str, packed["choices"])), _read_array("answer", packed["probabilities"]), raw)
 
 
 # -- in the policy's process -------------------------------------------------------------------------------------------
@@ -237,10 +237,11 @@ def load_policy(host: Host, name: str) -> dict[str, Any]:
 def _declare(thing: Any) -> dict[str, Any]:
     """Return what a class, or an instance, declares."""
     names = ("space", "needs", "frames", "default_revision")
-    told = {name: getattr(thing, name, getattr(Policy, name)) for name in names}
-    told = {name: getattr(Policy, name) if isinstance(value, property) else value for name, value in told.items()}
-    frames = told["frames"]
-    return {**told, "needs": list(told["needs"]), "frames": asdict(frames)}
+    defaults = {name: getattr(Policy, name) for name in names}
+    found = {name: getattr(thing, name, default) for name, default in defaults.items()}
+    declared = {name: defaults[name] if isinstance(value, property) else value for name, value in found.items()}
+    frames = declared["frames"]
+    return {**declared, "needs": list(declared["needs"]), "frames": asdict(frames)}
 
 
 def make_policy(host: Host, options: Mapping[str, Any]) -> dict[str, Any]:

@@ -34,7 +34,7 @@ from wiw import errors
 from wiw.errors import InfrastructureError
 from wiw.isolation.connection import receive, send
 from wiw.isolation.failures import EndedError, ExitError, LateError, RaisedError
-from wiw.isolation.segments import Segment, SegmentPool, place
+from wiw.isolation.segments import SegmentPool, SharedSegment, place
 from wiw.process_limits import find_memory_limit, make_child_environment
 
 STARTING = 120.0
@@ -140,7 +140,7 @@ class ChildProcess:
 
     def _pack(
         self, function: Callable[..., Any], arguments: tuple[Any, ...], answer: int
-    ) -> tuple[bytes, list[Segment], NDArray[np.uint8]]:
+    ) -> tuple[bytes, list[SharedSegment], NDArray[np.uint8]]:
         """Return the request, the segments that are new to the child, and the memory of the answer."""
         arrays: list[NDArray[np.uint8]] = []
         body = pickle.dumps((function, arguments), protocol=5, buffer_callback=lambda each: _take_out(each, arrays))
@@ -273,11 +273,11 @@ def _take_out(buffer: pickle.PickleBuffer, arrays: list[NDArray[np.uint8]]) -> b
     return False
 
 
-def _build_error(told: Any) -> Exception:
+def _build_error(message: Any) -> Exception:
     """Return the exception that a child has reported: one of wiw's own, or a substitute for a foreign one."""
-    told = told if isinstance(told, dict) else {}
-    text = str(told.get("text", ""))
-    name, kind = str(told.get("type", "")), told.get("kind")
+    message = message if isinstance(message, dict) else {}
+    text = str(message.get("text", ""))
+    name, kind = str(message.get("type", "")), message.get("kind")
     if name == "ExitError":
         return ExitError(text)
     own = getattr(errors, name, None) if name in errors.__all__ and name != "is_stop_request" else None
@@ -285,6 +285,6 @@ def _build_error(told: Any) -> Exception:
         return RaisedError(text)
     try:
         error: Exception = own(text, kind) if isinstance(kind, str) else own(text)
-    except TypeError:  # it takes more than the child has told
+    except TypeError:  # it takes more than the child reports
         return RaisedError(text)
     return error

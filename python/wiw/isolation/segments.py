@@ -28,7 +28,7 @@ ROUNDED = 2**20
 SEALS = fcntl.F_SEAL_SHRINK | fcntl.F_SEAL_GROW | fcntl.F_SEAL_SEAL
 
 
-class Segment:
+class SharedSegment:
     """One piece of shared memory, on the side that made it."""
 
     def __init__(self, name: int, size: int) -> None:
@@ -68,20 +68,20 @@ class SegmentPool:
 
     def __init__(self) -> None:
         self._names = itertools.count()
-        self._segments: list[Segment] = []
+        self._segments: list[SharedSegment] = []
 
-    def find(self, size: int) -> Segment:
+    def find(self, size: int) -> SharedSegment:
         """Return a free segment of at least so many bytes, made if there is none; free ones that are smaller go."""
         free = [segment for segment in self._segments if not segment.leased]
         fitting = [segment for segment in free if segment.size >= size]
         if fitting:
             return min(fitting, key=lambda segment: segment.size)
         self._segments = [segment for segment in self._segments if segment.leased]
-        made = Segment(next(self._names), max(ROUNDED, -(-size // ROUNDED) * ROUNDED))
+        made = SharedSegment(next(self._names), max(ROUNDED, -(-size // ROUNDED) * ROUNDED))
         self._segments.append(made)
         return made
 
-    def drop(self, segment: Segment) -> None:
+    def drop(self, segment: SharedSegment) -> None:
         """Leave a segment to the other side, which still reads it."""
         self._segments = [each for each in self._segments if each is not segment]
 

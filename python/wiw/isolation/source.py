@@ -37,7 +37,7 @@ class Source:
     def __init__(self, kind: str, name: str, load: Callable[[Host, str], dict[str, Any]]) -> None:
         self.kind, self.name, self._load = kind, name, load
         self._idle: ChildProcess | None = None
-        self.told = self.load(process := ChildProcess())
+        self.description = self._import(process := ChildProcess())
         self._idle = process
         _SOURCES.add(self)
 
@@ -62,21 +62,25 @@ class Source:
         self.load(process)
         return process
 
-    def load(self, process: ChildProcess) -> dict[str, Any]:
-        """Import the code in a process; return what it says of itself.
+    def load(self, process: ChildProcess) -> None:
+        """Import the code in a process.
 
         Raises:
             RegistryError: it cannot be imported.
             InfrastructureError: it has changed since it was first imported.
         """
+        found = self._import(process)
+        names = ("module", "name")  # a module's has the state of its file
+        if any(found[name] != self.description[name] for name in names):
+            raise InfrastructureError(f"{self.kind} '{self.name}' has changed since it was loaded; start a new run")
+
+    def _import(self, process: ChildProcess) -> dict[str, Any]:
+        """Import the code in a process; return what it says of itself."""
         try:
-            told: dict[str, Any] = process.call(self._load, self.name)[0]
+            description: dict[str, Any] = process.call(self._load, self.name)[0]
         except (EndedError, ExitError) as error:
             raise RegistryError(f"{self.kind} '{self.name}' cannot be loaded: {error}") from None
-        first = getattr(self, "told", told)
-        if (told["module"], told["name"]) != (first["module"], first["name"]):  # the module's name has the file's state
-            raise InfrastructureError(f"{self.kind} '{self.name}' has changed since it was loaded; start a new run")
-        return told
+        return description
 
 
 class Isolated:
@@ -135,7 +139,7 @@ class Isolated:
         process = self.source.take_process(self._memory_gb)
         cannot = f"{self.source.kind} '{self.source.name}' cannot be built"
         try:
-            told = process.call(function, *arguments, seconds=seconds)[0]
+            answer = process.call(function, *arguments, seconds=seconds)[0]
         except LateError as error:
             raise ConstructionError(
                 f"{cannot}: its constructor did not return within {seconds:g} s (deadline). Is it waiting for a "
@@ -145,7 +149,7 @@ class Isolated:
         except (EndedError, ExitError) as error:
             raise ConstructionError(f"{cannot}: {error}", error.kind) from None
         self._process = process
-        return told
+        return answer
 
     def _count_spent(self, spent: Mapping[str, Any]) -> None:
         """Note what the part has used up in its present process."""
@@ -164,13 +168,12 @@ def read_file_state(name: str) -> tuple[str, int, int] | None:
 def describe_class(thing: Any) -> dict[str, Any]:
     """Return the description of a class or factory, which is available before it is called."""
     makes = inspect.isclass(thing) or inspect.isroutine(thing) or isinstance(thing, partial)
+    parameters = inspect.signature(thing).parameters.values() if makes else ()
     return {
         "name": str(getattr(thing, "__name__", type(thing).__name__)),
         "module": str(getattr(thing, "__module__", "")),
         "doc": inspect.getdoc(thing) or "",
-        "parameters": [_describe_parameter(each) for each in inspect.signature(thing).parameters.values()]
-        if makes
-        else [],
+        "parameters": [_describe_parameter(each) for each in parameters],
     }
 
 
@@ -204,10 +207,10 @@ def build_signature(parameters: Sequence[Mapping[str, Any]], own: Mapping[str, t
     return inspect.Signature([*(parameter for parameter in built if parameter not in last), *added, *last])
 
 
-def _read_default(told: Any) -> Any:
-    if told is None:
+def _read_default(packed: Any) -> Any:
+    if packed is None:
         return inspect.Parameter.empty
-    return _HiddenDefault(told["repr"]) if "repr" in told else told["value"]
+    return _HiddenDefault(packed["repr"]) if "repr" in packed else packed["value"]
 
 
 class _HiddenDefault:

@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 from wiw.errors import ArgumentError, DependencyError, JudgeError
 from wiw.judging.judge import HIGHEST_MARK, LOWEST_MARK, Judge, Judgement, Reference
-from wiw.judging.prompts import JudgePrompt
+from wiw.judging.prompts.judge_prompt import JudgePrompt
 from wiw.vlm import Reply, Request, connect, user
 from wiw.vlm.cache import open_reply_cache
 from wiw.vlm.structured import find_json_object
@@ -40,7 +40,7 @@ class LanguageModelJudge(Judge):
     Args:
         llm: an address such as "http://localhost:8000/v1", or a client; see `wiw.vlm.connect`.
         model: its name there; None means the only one that the server offers.
-        prompts: folder with a template `judge.j2` that replaces the shipped one; see `wiw.judging.prompts`.
+        prompts: folder with a template `judge.j2` that replaces the shipped one; see `JudgePrompt`.
         temperature: of the sampling.
         seed: of the sampling; it is sent as it is.
         max_tokens: maximum number of tokens of a reply.

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from wiw.errors import ArgumentError, ContractError
 from wiw.policies.base import Policy, Situation
-from wiw.types import Answer, Goal, Proposal, TextAnswer
+from wiw.types import Answer, ArmObservation, Goal, Proposal, TextAnswer
 from wiw.world_models.base import WorldModel
 from wiw.world_models.oracle import Oracle
 
@@ -29,7 +29,7 @@ def check_observations(needs: Collection[str], observations: Sequence[Any]) -> N
     Raises:
         ArgumentError: an observation lacks one of them.
     """
-    if "wrist" in needs and any(getattr(observation, "wrist", None) is None for observation in observations):
+    if "wrist" in needs and not all(isinstance(each, ArmObservation) and each.wrist for each in observations):
         raise ArgumentError(
             "this agent needs the wrist camera's view, but got an observation without one: create the manipulation "
             "environment with cameras=('wrist',)"

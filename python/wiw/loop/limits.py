@@ -1,71 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Limits shared by all agents of a run; none of them changes an agent's decisions."""
-
-from __future__ import annotations
-
-from dataclasses import dataclass
-from pathlib import Path
-from typing import Annotated, Any
-
-from tyro.conf import arg
-
-from wiw.errors import ArgumentError
+"""Default limits of a world model's calls and of a rollout cache."""
 
 DEADLINE = 300.0
 """Default time limit of a call in seconds: enough for a first call that loads and compiles."""
 BUDGET_GB = 20.0
 """Default size limit of a rollout cache in gigabytes; a panorama takes 1.8 MB, a front view 0.7 MB."""
-NO_DEADLINE = 1e12
-"""Seconds that stand for no deadline where a number must be stored."""
-
-
-@dataclass(frozen=True, kw_only=True)
-class Limits:
-    """Limits of an agent's world model, and whether fidelity is measured.
-
-    Raises:
-        ArgumentError: a number out of range.
-    """
-
-    deadline: Annotated[float, arg(metavar="SECONDS")] = DEADLINE
-    """Time limit in seconds for a call to the world model. After three attempts the episode is recorded as an
-    infrastructure error, which is excluded from scores."""
-    cache: Annotated[str | Path, arg(metavar="auto|off|DIR")] = "auto"
-    """Where rollouts are cached, so that a model never computes the same one twice: auto (in ~/.cache/wiw/rollouts, for
-    models that declare themselves cacheable), a folder (for every model), or off."""
-    cache_gb: Annotated[float, arg(metavar="N")] = BUDGET_GB
-    """Maximum size of that folder in gigabytes; the least recently used rollouts are dropped first."""
-    fidelity: bool = False
-    """Whether to replay every imagined plan in the simulator, to measure how faithful imagination is. Changes no
-    decision, but takes about as long as the oracle."""
-    fidelity_share: Annotated[float, arg(metavar="SHARE")] = 1.0
-    """Share of the decisions, sampled by their keys, at which fidelity is measured."""
-    lpips: Annotated[str | Path | None, arg(metavar="auto|DIR")] = None
-    """Folder with the weights of LPIPS, to measure fidelity with it as well (auto: ~/.cache/wiw/weights). If they are
-    missing, the error says which files are needed."""
-
-    def __post_init__(self) -> None:
-        for name in ("deadline", "cache_gb"):
-            if not getattr(self, name) > 0:
-                raise ArgumentError(f"expected a {name} above 0, got {getattr(self, name)}")
-        if not 0 < self.fidelity_share <= 1:
-            raise ArgumentError(f"expected a fidelity_share above 0 and up to 1, got {self.fidelity_share}")
-
-    @property
-    def measures_fidelity(self) -> bool:
-        """Whether plans are replayed in the simulator."""
-        return self.fidelity or self.lpips is not None
-
-    def to_json(self) -> dict[str, Any]:
-        """Return the limits for the run store, independent of the working directory; `Limits(**...)` is the inverse."""
-        own = {name: getattr(self, name) for name in Limits.__dataclass_fields__}
-        own["deadline"] = min(self.deadline, NO_DEADLINE)
-        own["cache"], own["lpips"] = _make_absolute(self.cache), _make_absolute(self.lpips)
-        return own
-
-
-def _make_absolute(folder: str | Path | None) -> str | None:
-    """Return a folder as an absolute path, and words that stand for a folder unchanged."""
-    if folder is None or str(folder) in ("auto", "off"):
-        return None if folder is None else str(folder)
-    return str(Path(folder).expanduser().resolve())

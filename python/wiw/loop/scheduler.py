@@ -70,9 +70,16 @@ class LiveEpisode:
 
 
 def _open_environment(task: Any, needs: Collection[str]) -> Any:
-    """Return an environment whose observations have what an agent needs."""
-    cameras = {"cameras": ("wrist",)} if "wrist" in needs else {}
-    return task.environment(depth="depth" in needs, **cameras)
+    """Return an environment whose observations have what an agent needs.
+
+    Raises:
+        ArgumentError: the agent needs the view of a wrist camera, and the task has no cameras.
+    """
+    if "wrist" not in needs:
+        return task.environment(depth="depth" in needs)
+    if "cameras" not in task.sensor_options:
+        raise ArgumentError(f"this agent needs the view of a wrist camera, which task '{task.name}' does not have")
+    return task.environment(depth="depth" in needs, cameras=("wrist",))
 
 
 def run_episodes(

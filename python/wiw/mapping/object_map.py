@@ -345,11 +345,6 @@ class ObjectMap:
         """Return how many objects of a category there are."""
         return len(self.find(category, least_size))
 
-    def group_by_category(self) -> dict[str, tuple[MapObject, ...]]:
-        """Return the objects of each category, categories in alphabetical order."""
-        names = sorted({thing.category for thing in self.objects})
-        return {name: self.find(name) for name in names}
-
 
 def measure_overlap(one: MapObject, other: MapObject, mutual: bool = False) -> float:
     """Return the share of voxels of one that lie near the other's, or the other way round if that is more.

@@ -17,7 +17,6 @@ from wiw.mapping.views import CAMERA_HEIGHT, check_panorama
 
 CELL = 0.1
 """Metres."""
-AGENT_RADIUS = 0.1
 OBSTACLE = (0.1, 1.75)
 """Heights above the floor, in metres, between which a surface is in the agent's way. Its body is 1.5 m high; navigation
 meshes lie, and are rounded, up to 0.2 m higher, so that a lamp that hangs down to 1.7 m stops it."""

@@ -12,7 +12,7 @@ from rich.text import Text
 from wiw.analysis.errors import METRES, PSNR, STEP, Cost, CostGap, ErrorLine, ErrorTable
 from wiw.analysis.statistics import LEVEL, Difference, Estimate
 from wiw.analysis.summary import show_estimate, show_p
-from wiw.experiments.errors import ERRORS
+from wiw.experiments.errors.kinds import ERRORS
 from wiw.report.quality_tables import RANK_TITLES, show_rank
 from wiw.report.tables import ROOMY, print_stacked
 

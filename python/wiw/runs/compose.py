@@ -8,8 +8,8 @@ from dataclasses import dataclass, replace
 from typing import Any
 
 from wiw.errors import ArgumentError
-from wiw.experiments.errors import make_error
 from wiw.experiments.errors.erroneous import Erroneous
+from wiw.experiments.errors.kinds import make_error
 from wiw.experiments.fidelity import FidelityObserver
 from wiw.experiments.gating import Gated
 from wiw.experiments.ground_truth import TruePlans, TrueScores, sort_stages
@@ -20,10 +20,11 @@ from wiw.loop.agent_spec import AgentSpec, space_option
 from wiw.loop.attempts import Attempted, make_model
 from wiw.loop.imagination import Imaginer, ModelInput
 from wiw.loop.keys import make_key
-from wiw.loop.limits import DEADLINE, Limits
+from wiw.loop.limits import DEADLINE
 from wiw.loop.model_imaginer import ModelImaginer
 from wiw.loop.rollout_cache import cache_rollouts
 from wiw.registry import WORLD_MODELS
+from wiw.runs.limits import Limits
 from wiw.types import PRIMITIVES, Episode, Key
 from wiw.world_models.base import WorldModel
 from wiw.world_models.oracle import Oracle

@@ -11,8 +11,8 @@ from typing import Annotated, Any, Literal
 from tyro.conf import arg
 
 from wiw.errors import ArgumentError
-from wiw.loop.limits import Limits
 from wiw.ray_cluster import Engine
+from wiw.runs.limits import Limits
 from wiw.runs.shards import Shard
 from wiw.types import check_seed
 

@@ -11,8 +11,8 @@ from typing import Any
 
 from wiw.loop.config import AgentConfig
 from wiw.mapping_files import read_yaml_mapping
-from wiw.policies.vlm.prompt_import import CARD
-from wiw.policies.vlm.prompts import DEFAULT, SETS, Prompts
+from wiw.policies.vlm.prompt_import.importer import CARD
+from wiw.policies.vlm.prompts.templates import DEFAULT, SETS, Prompts
 from wiw.registry import POLICIES
 from wiw.runs.recipes import ELSEWHERE, REFERENCES, AgentRecipe, find_control
 from wiw.runs.rows import to_json

@@ -19,7 +19,7 @@ def describe_platform() -> dict[str, Any]:
         "processor": processor_name(),
         "cores": len(os.sched_getaffinity(0)),
         "isa": core.active_isa(),
-        "packages": {name: _find_version(name) for name in ("numpy", "scipy", "opencv-python-headless", "torch")},
+        "packages": {name: find_version(name) for name in ("numpy", "scipy", "opencv-python-headless", "torch")},
     }
 
 
@@ -33,7 +33,8 @@ def processor_name() -> str:
     return names[0] if names else platform.machine()
 
 
-def _find_version(package: str) -> str | None:
+def find_version(package: str) -> str | None:
+    """Return the version of an installed package; None where it is not installed."""
     try:
         return importlib.metadata.version(package)
     except importlib.metadata.PackageNotFoundError:

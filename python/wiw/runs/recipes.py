@@ -12,25 +12,25 @@ from typing import Any, cast
 from wiw.envs.base import Env
 from wiw.errors import ArgumentError
 from wiw.experiments.counterparts import is_counterpart
-from wiw.experiments.errors import make_error
 from wiw.experiments.errors.erroneous import require_error
+from wiw.experiments.errors.kinds import make_error
 from wiw.experiments.placebos import PLACEBOS, require_words
 from wiw.loop.agent import Agent
 from wiw.loop.agent_spec import AgentSpec, space_option
 from wiw.loop.base import BaseAgent
 from wiw.loop.config import AgentConfig
 from wiw.loop.imagination import Imaginer
-from wiw.loop.limits import Limits
 from wiw.loop.observers import Observer
 from wiw.policies.base import Policy
 from wiw.registry import ISOLATED, POLICIES, SEMANTICS, TRACKERS, WORLD_MODELS
 from wiw.runs.arm_text import EXAMPLE, ArmText, check_arm_name, parse_arm
 from wiw.runs.compose import Experiment, RunContext, compose, make_for_space, require_placebo
+from wiw.runs.limits import Limits
 from wiw.runs.part_options import parse_options
 from wiw.runs.sources import source_digests
 from wiw.tasks.base import Task
 from wiw.types import PRIMITIVES
-from wiw.world_models.base import WorldModel
+from wiw.world_models.base import WorldModel, find_accepts
 
 PLACEBO, PLACEBO_MODEL = "placebo-", "warp"
 """Beginning of the names of placebo arms, and the model that they use where nobody names one."""
@@ -326,14 +326,14 @@ def _unwrap(part: Any) -> Any:
 
 def find_control(model: Any) -> str:
     """Return how a world model, or one of that name, is told plans; empty if only the model itself can say."""
-    found = WORLD_MODELS.find(model) if isinstance(model, str) else model
-    return str(getattr(getattr(found, "accepts", None), "control", ""))
+    declared = find_accepts(WORLD_MODELS.find(model) if isinstance(model, str) else model)
+    return declared.control if declared else ""
 
 
 def _has_simulator(model: Any) -> bool:
     """Return whether a world model, or one of that name, is given the simulator; of the built-in ones oracle is."""
-    found = WORLD_MODELS.find(model) if isinstance(model, str) else model
-    return model == ERROR_MODEL or "simulator" in getattr(getattr(found, "accepts", None), "needs", ())
+    declared = find_accepts(WORLD_MODELS.find(model) if isinstance(model, str) else model)
+    return model == ERROR_MODEL or (declared is not None and "simulator" in declared.needs)
 
 
 def _describe(part: Any) -> Any:

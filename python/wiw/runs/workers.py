@@ -23,8 +23,8 @@ from typing import Any, Protocol
 from wiw._core import core
 from wiw.errors import Error, InfrastructureError
 from wiw.isolation.source import end_idle_processes
-from wiw.loop.limits import Limits
 from wiw.runs.compose import RunContext
+from wiw.runs.limits import Limits
 from wiw.runs.rows import AgentRow, DecisionRow, LostRow, OutcomeRow, RestartRow, decision_row
 from wiw.runs.sources import require_unchanged
 from wiw.types import DecisionRecord, Episode, EpisodeResult

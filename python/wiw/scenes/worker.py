@@ -8,7 +8,7 @@ from typing import Any
 
 from wiw import _core
 from wiw.scenes.child import answer_job
-from wiw.scenes.scans import read_scene
+from wiw.scenes.scans.formats import read_scene
 
 
 def import_scene(job: dict[str, Any]) -> dict[str, Any]:

@@ -6,7 +6,6 @@ from __future__ import annotations
 import asyncio
 import contextlib
 import hmac
-import ipaddress
 import json
 import logging
 import ssl
@@ -30,6 +29,7 @@ from wiw.serving.answer_cache import AnswerCache
 from wiw.serving.outbox import Outbox
 from wiw.serving.queue import Job, Queue
 from wiw.serving.worker import Outcome, Worker
+from wiw.wire.loopback import is_loopback
 from wiw.wire.messages import Answer, Ask, Hello, Message, Refusal, Wait, Welcome, decode, encode
 from wiw.wire.rows import row_id, unpack_row
 from wiw.world_models.base import WorldModel
@@ -383,11 +383,3 @@ def _sources(model: WorldModel, fingerprint: str) -> dict[str, Any]:
     """Return an identifier of the version of a model that declares none: digests of its source files, by name."""
     digests = {} if fingerprint else source_digests(model)
     return {"sources": {Path(path).name: digest for path, digest in digests.items()}} if digests else {}
-
-
-def is_loopback(host: str) -> bool:
-    """Return whether an address to listen on is of this machine alone."""
-    try:
-        return ipaddress.ip_address(host).is_loopback
-    except ValueError:
-        return host == "localhost"

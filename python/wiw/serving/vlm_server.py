@@ -17,10 +17,10 @@ from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
 from typing import Any
 
 from wiw.errors import ArgumentError, Error
-from wiw.serving.server import is_loopback
 from wiw.vlm.base import Client
 from wiw.vlm.images import from_data_uri
 from wiw.vlm.messages import Call, Completion, Message, Part
+from wiw.wire.loopback import is_loopback
 
 MOST_BYTES = 256 << 20
 """Maximum size of a request's body in bytes."""

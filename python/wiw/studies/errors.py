@@ -17,7 +17,7 @@ from typing import Any
 
 from wiw.analysis.errors import ErrorTable, summarise_errors
 from wiw.errors import ArgumentError, StoreError
-from wiw.experiments.errors import ERRORS
+from wiw.experiments.errors.kinds import ERRORS
 from wiw.loop import keys
 from wiw.metrics import Lpips
 from wiw.registry import task_class

@@ -14,11 +14,11 @@ from typing import Any
 from wiw.analysis.stopping import StopRule, parse_stop_rule
 from wiw.errors import ArgumentError, Error, StoreError
 from wiw.loop import keys
-from wiw.loop.limits import Limits
 from wiw.metrics import Lpips
 from wiw.runs.config import EngineConfig, ResumeConfig, RunConfig, read_resume_settings, take_settings
 from wiw.runs.departures import describe_departures
 from wiw.runs.execute import read_recipes, require_left, run_pending, sources_of, update_own_sources
+from wiw.runs.limits import Limits
 from wiw.runs.pictures import pool_episodes
 from wiw.runs.platform import describe_platform
 from wiw.runs.recipes import (

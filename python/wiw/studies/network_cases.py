@@ -125,7 +125,7 @@ def _draw_armnet(network: Any, batch: int) -> Inputs:
 
 
 def _make_navigator() -> nn.Module:
-    from wiw.policies.navigator import WEIGHTS
+    from wiw.policies.navigator.policy import WEIGHTS
     from wiw.policies.navigator.weights import load
 
     return load(WEIGHTS)[0]
@@ -140,7 +140,7 @@ def _draw_navigator(network: Any, batch: int) -> Inputs:
 
 def _make_recogniser() -> nn.Module:
     from wiw.perception.recogniser import Recogniser
-    from wiw.policies.recogniser import WEIGHTS
+    from wiw.policies.recogniser.policy import WEIGHTS
 
     return Recogniser.load(WEIGHTS).network
 
@@ -205,7 +205,7 @@ PATHS, STEPS = 16, 20
 
 
 def _make_diffuser() -> nn.Module:
-    from wiw.policies.diffuser import BUILT_IN
+    from wiw.policies.diffuser.policy import BUILT_IN
     from wiw.policies.diffuser.weights import load
 
     return load(BUILT_IN)[0]

@@ -52,8 +52,6 @@ _OWN_SETTINGS = ("out", "resume", "progress", "workers", "shard")
 _QUALITY_KEYS = ("scorers", "frames", "lpips", "deadline")
 _VARIABLE = re.compile(r"\{(\w+)\}")
 
-Mappings = Mapping[str, Mapping[str, Any]]
-
 
 @dataclass(frozen=True)
 class StudyRun:

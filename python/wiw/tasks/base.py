@@ -62,7 +62,11 @@ class Task(ABC):
 
     @abstractmethod
     def environment(self, depth: bool = False) -> Env:
-        """Return a new environment for the task's episodes, with or without `depth` in the observations."""
+        """Return a new environment for the task's episodes, with or without `depth` in the observations.
+
+        If the task has `sensor_options`, it takes these, too. The loop passes one of them, `cameras=("wrist",)`, for an
+        agent that needs the view of a wrist camera.
+        """
 
     @abstractmethod
     def episodes(self, count: int) -> list[Episode]:

@@ -10,10 +10,10 @@ import torch
 from numpy.typing import NDArray
 from scipy.spatial.distance import pdist
 
-from wiw.policies.diffuser import STEPS
 from wiw.policies.diffuser.diffusion import sample_ddim
 from wiw.policies.diffuser.network import Network, to_tensors
 from wiw.policies.diffuser.paths import SCALE, to_vectors
+from wiw.policies.diffuser.policy import STEPS
 from wiw.training.diffuser import Samples
 
 NEAR = 0.03

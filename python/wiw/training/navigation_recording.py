@@ -18,7 +18,7 @@ from wiw.datasets.worlds import World
 from wiw.errors import ArgumentError
 from wiw.training.jobs import count_threads
 from wiw.training.navigation_rules import NavigationRules
-from wiw.training.traversal import HEADINGS, TURN_RAD, Segment, Traversal
+from wiw.training.traversal import HEADINGS, TURN_RAD, Traversal, TraversalSegment
 
 Backend = Literal["auto", "cpu", "gpu"]
 BATCH = 32
@@ -129,7 +129,7 @@ def record_segment(
     )
 
 
-def find_sources(segment: Segment, options: NavigationCollection) -> NDArray[np.int64]:
+def find_sources(segment: TraversalSegment, options: NavigationCollection) -> NDArray[np.int64]:
     """Return for each frame the one whose picture shows it: the first at its position, or itself in perspective."""
     frames = np.arange(len(segment))
     if options.perspective:
@@ -141,7 +141,7 @@ def find_sources(segment: Segment, options: NavigationCollection) -> NDArray[np.
 def _picture(
     world: World,
     traversal: Traversal,
-    segment: Segment,
+    segment: TraversalSegment,
     poses: NDArray[np.float64],
     floor: NDArray[np.float64],
     shown: NDArray[np.int64],

@@ -43,7 +43,7 @@ Ending = Literal["reached", "stuck", "cap"]
 
 
 @dataclass(frozen=True)
-class Segment:
+class TraversalSegment:
     """T frames from one waypoint towards the next. Frame 0 is before the first action, and its action is Null."""
 
     positions: NDArray[np.float32]
@@ -68,7 +68,7 @@ class Traversal:
     island: int
     north: float
     """Heading 0, radians to the left of the world's -Z; random, so that walls are seen at all angles."""
-    segments: tuple[Segment, ...]
+    segments: tuple[TraversalSegment, ...]
     waypoints: NDArray[np.float32]
     """float32 [W, 3]: all that were selected, in descending order of leaf score."""
     dropped: int
@@ -134,7 +134,7 @@ def plan_traversal(
     waypoints = Waypoints(navmesh, island, core.fold_key([key, 0]), rules)
     north = 2 * np.pi * float(core.uniform(core.fold_key([key, 1]), 1)[0])
     follower, current, dropped = _start(navmesh, waypoints, core.fold_key([key, 2]), north, rules)
-    segments: list[Segment] = []
+    segments: list[TraversalSegment] = []
     left = min(max_frames or rules.max_scene_frames, rules.max_scene_frames)
     while (
         left >= 2 and follower.can_step() and (following := waypoints.find_next(follower.position, current)) is not None
@@ -171,7 +171,7 @@ def _start(
     return follower, int(index), dropped
 
 
-def measure_coverage(navmesh: NavMesh, samples: NDArray[np.float32], segments: Sequence[Segment]) -> float:
+def measure_coverage(navmesh: NavMesh, samples: NDArray[np.float32], segments: Sequence[TraversalSegment]) -> float:
     """Return the share of samples [N, 3] within a geodesic distance of `COVERAGE_RADIUS` of any recorded position."""
     if not segments:
         return 0.0
@@ -201,7 +201,7 @@ class Follower:
         """Return whether a step is free in any heading."""
         return any(self._step_end(heading) is not None for heading in range(HEADINGS))
 
-    def follow(self, waypoint: NDArray[np.float32], max_frames: int) -> Segment:
+    def follow(self, waypoint: NDArray[np.float32], max_frames: int) -> TraversalSegment:
         """Walk to a waypoint [3]; end there, where the agent is stuck, or after `max_frames` frames."""
         positions, headings, actions = [self.position], [self.heading], [int(NULL)]
         ending: Ending = "cap"
@@ -214,7 +214,9 @@ class Follower:
             positions.append(self.position)
             headings.append(self.heading)
             actions.append(action)
-        return Segment(np.stack(positions), np.array(headings, np.int64), np.array(actions, np.int8), waypoint, ending)
+        return TraversalSegment(
+            np.stack(positions), np.array(headings, np.int64), np.array(actions, np.int8), waypoint, ending
+        )
 
     def _walk(self, waypoint: NDArray[np.float32]) -> Iterator[int | Literal["reached", "stuck"]]:
         """Carry out actions, yielding each once it is done; at last how the walk ended."""

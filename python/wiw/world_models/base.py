@@ -227,6 +227,12 @@ def _is_installed(name: str) -> bool:
         return False
 
 
+def find_accepts(model: Any) -> Accepts | None:
+    """Return what a model, its class or a factory declares; None where only the model, once made, can say."""
+    declared = getattr(model, "accepts", None)
+    return declared if isinstance(declared, Accepts) else None
+
+
 class WorldModel(ABC):
     """Predicts what an agent would see. Subclasses set `accepts` and implement `rollout`."""
 

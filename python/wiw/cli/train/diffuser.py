@@ -38,7 +38,7 @@ def train_diffuser(
         epochs: Number of epochs: how often each sample is used, on average. Default: 40.
         limits: Time limit and seed.
     """
-    from wiw.policies.diffuser import require_torch
+    from wiw.policies.diffuser.policy import require_torch
 
     check_counts(epochs=epochs)
     require_torch()

@@ -39,8 +39,6 @@ EXPOSURES = (0.85, 1.0, 1.18)
 LOOKS = 4
 """Views in which a thing's colour must have one name."""
 
-Overlay = Mapping[str, Mapping[str, str]]
-
 
 @dataclass(frozen=True)
 class Attributes:

@@ -6,7 +6,6 @@ Who answers both rightly has looked; no prior of homes, and no memory of the apa
 
 from __future__ import annotations
 
-import re
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 
@@ -22,6 +21,7 @@ from wiw.datasets.worlds import World, world
 from wiw.errors import ArgumentError
 from wiw.nav import Ground, NavMesh
 from wiw.render import Renderer
+from wiw.scenes.specs import parse_single
 
 KINDS = ("color", "state", "remove", "swap")
 TRIES = 4
@@ -90,11 +90,8 @@ def open_unlit(spec: str, backend: Backend) -> World:
 
 def outline(spec: str) -> scenes.Scene:
     """Return an apartment's scene without its light."""
-    base, _, edits = spec.partition("?")
-    match = re.fullmatch(scenes.APARTMENTS, base)
-    if match is None or match[4] is None:
-        raise ArgumentError(f"scene spec '{spec}': expected a single apartment, such as apartments:val/7")
-    return scenes.apartment_table(int(match[4]), match[1], edits=edits.split("&") if edits else ())
+    seed, split, edits = parse_single(spec)
+    return scenes.apartment_table(seed, split, edits=edits)
 
 
 def may_have_twin(question: Answerable, table: SceneTable, edits: Sequence[Edit]) -> bool:

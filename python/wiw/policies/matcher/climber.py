@@ -6,7 +6,7 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from wiw.policies.matcher import HEADINGS, Matcher, Memory
+from wiw.policies.matcher.policy import HEADINGS, Matcher, Memory
 
 NEIGHBOURHOOD = 1.5
 """Metres within which remembered places inform about the slope here."""

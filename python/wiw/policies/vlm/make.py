@@ -6,9 +6,9 @@ from __future__ import annotations
 import inspect
 from typing import Any
 
-from wiw.policies.vlm import VLM
-from wiw.policies.vlm.arm import ArmVLM
-from wiw.policies.vlm.questions import QuestionVLM
+from wiw.policies.vlm.arm.policy import ArmVLM
+from wiw.policies.vlm.policy import VLM
+from wiw.policies.vlm.questions.policy import QuestionVLM
 from wiw.types import GRIPPER_POSES, PRIMITIVES
 
 

@@ -34,19 +34,27 @@ def plan_schema(longest: int, count: int = 1) -> type[BaseModel]:
     names = Literal["forward", "turn_left", "turn_right"]
     strict: Any = ConfigDict(extra="forbid")
     actions: Any = (list[names], Field(min_length=1, max_length=longest))
-    plan = create_model("Plan", __config__=strict, reason=(str, ...), actions=actions)
+    return allow_several(create_model("Plan", __config__=strict, reason=(str, ...), actions=actions), count)
+
+
+def allow_several(plan: type[BaseModel], count: int) -> type[BaseModel]:
+    """Return the schema {plans: [...]} of up to `count` plans; that of a single plan where count is 1."""
+    from pydantic import ConfigDict, Field, create_model
+
     if count == 1:
         return plan
     plans: Any = (list[plan], Field(min_length=1, max_length=count))  # type: ignore[valid-type]
-    return create_model("Plans", __config__=strict, plans=plans)
+    return create_model(f"{plan.__name__}s", __config__=ConfigDict(extra="forbid"), plans=plans)
+
+
+def list_plans(value: Any) -> list[Any]:
+    """Return the plans of an answer that is valid by a schema of `allow_several`."""
+    return list(value.plans) if "plans" in type(value).model_fields else [value]
 
 
 def parse_plans(value: Any) -> list[tuple[NDArray[np.int8], str]]:
     """Return primitives and reasons of a validated answer."""
-    return [
-        (np.array([PRIMITIVES[name] for name in plan.actions], np.int8), plan.reason)
-        for plan in getattr(value, "plans", None) or [value]
-    ]
+    return [(np.array([PRIMITIVES[name] for name in plan.actions], np.int8), plan.reason) for plan in list_plans(value)]
 
 
 def describe_actions(actions: Sequence[int] | NDArray[np.int8]) -> list[str]:

@@ -18,7 +18,6 @@ from collections.abc import Sequence
 from concurrent.futures import Future
 from concurrent.futures import TimeoutError as LateError
 from dataclasses import dataclass, field
-from ipaddress import ip_address
 from pathlib import Path
 from typing import Any
 from urllib.parse import urlsplit
@@ -31,6 +30,7 @@ from websockets.exceptions import ConnectionClosed, InvalidStatus
 import wiw
 from wiw.errors import ContractError, RemoteError
 from wiw.wire.address_book import ServerAddress, read_addresses
+from wiw.wire.loopback import is_loopback
 from wiw.wire.messages import MOST_BYTES, Answer, Ask, Hello, Refusal, Wait, Welcome, decode, encode
 from wiw.wire.rows import row_id
 
@@ -216,7 +216,7 @@ class Link:
         return connect(
             server.address,
             additional_headers={} if server.token is None else {"Authorization": f"Bearer {server.token}"},
-            proxy=None if _is_loopback(server.address) else True,
+            proxy=None if is_loopback(urlsplit(server.address).hostname or "") else True,
             compression=None,
             max_size=MOST_BYTES,
             open_timeout=HANDSHAKE,
@@ -357,12 +357,3 @@ def _error(refusal: Refusal) -> Exception:
     if refusal.kind in BREACHES:
         return ContractError(refusal.text, refusal.kind)
     return RemoteError(refusal.text, refusal.kind)
-
-
-def _is_loopback(address: str) -> bool:
-    """Return whether the address is on this machine, where no proxy is used."""
-    host = urlsplit(address).hostname or ""
-    try:
-        return ip_address(host).is_loopback
-    except ValueError:
-        return host == "localhost"

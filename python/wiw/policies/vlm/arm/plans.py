@@ -11,6 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from wiw.action import PoseGrid
+from wiw.policies.vlm.plans import allow_several, list_plans
 from wiw.tabletop.workbench import TABLE
 from wiw.types import Proposal
 
@@ -37,12 +38,12 @@ def plan_schema(longest: int, count: int = 1) -> type[BaseModel]:
     from pydantic import ConfigDict, Field, WithJsonSchema, create_model
 
     strict: Any = ConfigDict(extra="forbid")
-    told = WithJsonSchema({"type": "integer", "minimum": 0, "maximum": max(GRID.bins, GRID.turns)})
-    number = Annotated[int, Field(ge=-NUMBER_LIMIT, le=NUMBER_LIMIT), told]
+    sent = WithJsonSchema({"type": "integer", "minimum": 0, "maximum": max(GRID.bins, GRID.turns)})
+    number = Annotated[int, Field(ge=-NUMBER_LIMIT, le=NUMBER_LIMIT), sent]
     numbers: Any = (list[number], Field(min_length=7, max_length=7))
     step = create_model("Step", __config__=strict, action=numbers)
     steps: Any = (list[step], Field(min_length=1, max_length=longest))  # type: ignore[valid-type]
-    plan = create_model(
+    plan: type[BaseModel] = create_model(
         "Plan",
         __config__=strict,
         visual_state_description=(str, ...),
@@ -50,10 +51,7 @@ def plan_schema(longest: int, count: int = 1) -> type[BaseModel]:
         language_plan=(str, ...),
         executable_plan=steps,
     )
-    if count == 1:
-        return plan
-    plans: Any = (list[plan], Field(min_length=1, max_length=count))  # type: ignore[valid-type]
-    return create_model("Plans", __config__=strict, plans=plans)
+    return allow_several(plan, count)
 
 
 def parse_plans(value: Any) -> list[Proposal]:
@@ -62,13 +60,13 @@ def parse_plans(value: Any) -> list[Proposal]:
         Proposal(
             GRID.decode(_to_numbers(plan)), note=plan.reasoning_and_reflection, text=SCENE_WORDS + plan.language_plan
         )
-        for plan in getattr(value, "plans", None) or [value]
+        for plan in list_plans(value)
     ]
 
 
 def count_out_of_range(value: Any) -> int:
     """Return how many numbers of a validated answer were clamped or wrapped."""
-    written = [_to_numbers(plan) for plan in getattr(value, "plans", None) or [value]]
+    written = [_to_numbers(plan) for plan in list_plans(value)]
     most = np.array([GRID.bins] * 3 + [GRID.turns] * 3 + [1])
     return sum(int(((numbers < 0) | (numbers > most)).sum()) for numbers in written)
 

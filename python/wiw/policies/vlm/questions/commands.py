@@ -17,8 +17,8 @@ from numpy.typing import NDArray
 from wiw.mapping.landmarks import Landmark
 from wiw.mapping.marks import MarkedViews
 from wiw.mapping.views import VIEW_NAMES
-from wiw.policies.vlm import shorten
-from wiw.policies.vlm.plans import PRIMITIVES
+from wiw.policies.vlm.plans import PRIMITIVES, allow_several, list_plans
+from wiw.policies.vlm.policy import shorten
 
 if TYPE_CHECKING:
     from pydantic import BaseModel
@@ -77,11 +77,7 @@ def command_schema(marks: tuple[int, ...], count: int = 1, answers: bool = True)
         "read_landmark": field_validator("chosen_landmark", mode="before")(_read_number),
         "read_answer": field_validator("answer", mode="before", check_fields=False)(_read_null),
     }
-    command = create_model("Command", __config__=strict, __validators__=loose, **fields)
-    if count == 1:
-        return command
-    plans: Any = (list[command], Field(min_length=1, max_length=count))  # type: ignore[valid-type]
-    return create_model("Commands", __config__=strict, plans=plans)
+    return allow_several(create_model("Command", __config__=strict, __validators__=loose, **fields), count)
 
 
 @lru_cache(maxsize=1)
@@ -113,7 +109,7 @@ def parse_commands(value: Any, marked: MarkedViews) -> list[Command]:
 
     A landmark has one number in all views, so that it counts where another view was named beside it.
     """
-    return [_parse_command(each, marked) for each in getattr(value, "plans", None) or [value]]
+    return [_parse_command(each, marked) for each in list_plans(value)]
 
 
 def parse_walk(value: Any) -> NDArray[np.int8]:

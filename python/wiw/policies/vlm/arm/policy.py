@@ -11,9 +11,17 @@ import numpy as np
 
 from wiw._core import core
 from wiw.policies.base import FrameSpec, Situation
-from wiw.policies.vlm import FALLBACK_NOTE, FALLBACK_SEED, MAX_PLAN_TOKENS, REVISION_SEED, VLM, derive_seed, shorten
 from wiw.policies.vlm.arm import plans, prompt_images
 from wiw.policies.vlm.arm.plans import GRID
+from wiw.policies.vlm.policy import (
+    FALLBACK_NOTE,
+    FALLBACK_SEED,
+    MAX_PLAN_TOKENS,
+    REVISION_SEED,
+    VLM,
+    derive_seed,
+    shorten,
+)
 from wiw.tabletop.base import PALETTE
 from wiw.types import GRIPPER_POSES, Proposal, Rollout
 from wiw.vlm import Reply, Request, user

@@ -16,7 +16,7 @@ from wiw.errors import PromptError
 from wiw.files import atomic_folder
 from wiw.policies.vlm.prompt_import.slots import convert_slots
 from wiw.policies.vlm.prompt_import.sources import FoundPrompt, read_source
-from wiw.policies.vlm.prompts import FOLDER, SETS, Prompts, get_slots
+from wiw.policies.vlm.prompts.templates import FOLDER, SETS, Prompts, get_slots
 
 CARD = "prompts.yaml"
 """File in a prompt folder that says where each template came from."""

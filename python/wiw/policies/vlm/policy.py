@@ -20,7 +20,7 @@ from wiw.errors import ArgumentError, DependencyError
 from wiw.perception.tracking import Track, Tracker, get_target, track_rollouts
 from wiw.policies.base import FrameSpec, Policy, Situation
 from wiw.policies.vlm import plans, presets, prompt_images
-from wiw.policies.vlm.prompts import Prompts
+from wiw.policies.vlm.prompts.templates import Prompts
 from wiw.registry import TRACKERS
 from wiw.types import Answer, Exchange, Goal, Key, Observation, Proposal, Rollout, TextAnswer
 from wiw.vlm import Reply, Request, connect, user

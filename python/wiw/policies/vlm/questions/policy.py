@@ -15,7 +15,8 @@ from wiw.errors import ArgumentError
 from wiw.mapping.views import HFOV_DEG, VIEW_NAMES, cut_views
 from wiw.perception.scene_labels import Labeller, SceneLabels
 from wiw.policies.base import FrameSpec, Situation
-from wiw.policies.vlm import MAX_PLAN_TOKENS, REVISION_SEED, VLM, Memory, derive_seed, plans
+from wiw.policies.vlm import plans
+from wiw.policies.vlm.policy import MAX_PLAN_TOKENS, REVISION_SEED, VLM, Memory, derive_seed
 from wiw.policies.vlm.questions import commands, prompt_images, steering
 from wiw.policies.vlm.questions.commands import Command
 from wiw.policies.vlm.questions.home_map import HomeMap, Sight

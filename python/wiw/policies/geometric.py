@@ -14,8 +14,9 @@ from numpy.typing import NDArray
 
 from wiw import panorama
 from wiw.policies.base import Situation
-from wiw.policies.matcher import HEADINGS, Matcher, Memory, appearance
+from wiw.policies.matcher import appearance
 from wiw.policies.matcher.exploration import CELL, FAR_DISTANCE, HALF, compute_distance_field, to_cells
+from wiw.policies.matcher.policy import HEADINGS, Matcher, Memory
 from wiw.types import Goal, Key, Observation
 
 VIEW = 320

@@ -2,7 +2,7 @@
 """Prompt templates: one folder per task, one Jinja file per question, with the paper's slots.
 
 There are sets of them. `default` lies here; `minimal`, in a folder of its own, has slots and schemas and gives no
-advice. A user's own folder may replace either (`wiw.policies.vlm.prompt_import` makes one of a copy of the paper).
+advice. A user's own folder may replace either (`wiw prompts import` makes one of a copy of the paper).
 
 Slots of all tasks: `look_ahead_action_num` (actions of a plan) and `plan_num` (number of plans requested). Navigation
 and recognition: `obs_key` (the observation in words) and `actions` (name to meaning). Manipulation: `position_bins`,

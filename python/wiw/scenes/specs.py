@@ -1,0 +1,116 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Scene specs: which scenes a text such as "apartments:val:40" names."""
+
+from __future__ import annotations
+
+import difflib
+import re
+from os import PathLike, fspath
+from pathlib import Path
+
+from wiw import _core
+from wiw.errors import ArgumentError, FileError
+from wiw.scenes.scans import formats
+from wiw.suggestions import did_you_mean
+
+SPLIT_SIZE = 1000
+"""Number of apartments in a spec without a number."""
+APARTMENTS = r"apartments:(train|val|test)(?:(?::([0-9]+))?:([1-9][0-9]*)|/([0-9]+))?"
+"""Split, first, end, and number of a single one. A single one may be followed by "?" and edits, joined by "&"."""
+_FORMS = (
+    "apartments:{train,val,test}, apartments:val:40, apartments:val:40:60, apartments:val/7 or "
+    "apartments:val/7?state:floor_lamp_1=off&color:sofa_1=blue"
+)
+
+
+def is_generated(spec: str) -> bool:
+    """Return whether a scene spec names generated apartments rather than a file."""
+    return spec.startswith("apartments:")
+
+
+def strip_edits(spec: str) -> str:
+    """Return the apartment that an edited one is a copy of: "apartments:val/7" for "apartments:val/7?remove:tv_1"."""
+    return spec.partition("?")[0] if is_generated(spec) else spec
+
+
+def absolute(spec: str | PathLike[str]) -> str:
+    """Return the spec, made absolute if it is a path, so that it means the same in any folder."""
+    spec = fspath(spec)
+    scan = formats.parse_spec(spec)
+    if scan is not None:
+        kind, folder, split = scan
+        return ":".join(filter(None, [kind, str(folder.expanduser().absolute()), split]))
+    return spec if is_generated(spec) or _resembles_generated(spec) else str(Path(spec).expanduser().absolute())
+
+
+def resolve(spec: str | PathLike[str]) -> list[str]:
+    """Return the single scenes that a scene spec names, in order, without loading them.
+
+    "apartments:val" and "apartments:val:40" are the first 1000 or 40 apartments of a split, "apartments:val:40:60" are
+    numbers 40 to 59, each named "apartments:val/7"; "hm3d:DIR:val" is each scan of a dataset's split, by its file (see
+    `wiw.scenes.scans.formats.KINDS`); anything else is the path of a mesh or a Gazebo world. The edits of
+    "apartments:val/7?state:floor_lamp_1=off&color:sofa_1=blue" are put into canonical order and spelling, so that equal
+    scenes have equal names; whether the apartment allows them is checked when it is opened.
+
+    Raises:
+        ArgumentError: the split, the count or an edit is invalid.
+        FileError: the file does not exist, or the folder has no scan.
+    """
+    spec = fspath(spec)
+    scan = formats.parse_spec(spec)
+    if scan is not None:
+        return [str(file) for file in formats.find_scans(*scan)]
+    if not is_generated(spec):
+        if not Path(spec).expanduser().is_file():
+            raise FileError(
+                f"{spec}: no such file; expected a mesh, a Gazebo world, apartments:{{train,val,test}}[:N], or scans "
+                f"such as hm3d:DIR:val ({', '.join(formats.KINDS)}).{_did_you_mean(spec)}"
+            )
+        return [spec]
+    base, mark, edits = spec.partition("?")
+    match = re.fullmatch(APARTMENTS, base)
+    if match is None or int(match[2] or 0) >= int(match[3] or SPLIT_SIZE):
+        raise ArgumentError(f"scene spec '{spec}': expected {_FORMS}.{_did_you_mean(base)}")
+    split, first, end, index = match.groups()
+    if index is not None:
+        return [base + mark + "&".join(_parse_edits(spec, edits))] if mark else [spec]
+    if mark:
+        raise ArgumentError(f"scene spec '{spec}': edits belong to a single apartment; expected {_FORMS}.")
+    return [f"apartments:{split}/{i}" for i in range(int(first or 0), int(end or SPLIT_SIZE))]
+
+
+def _resembles_generated(spec: str) -> bool:
+    """Return whether a spec is not a file and looks like a misspelt `apartments:`, to be refused as typed."""
+    kind, colon, _ = spec.partition(":")
+    return bool(colon and did_you_mean(kind, ["apartments"])) and not Path(spec).expanduser().exists()
+
+
+def _parse_edits(spec: str, edits: str) -> list[str]:
+    """Return the edits of a spec in their canonical order."""
+    try:
+        return _core.scene.canonical_edits(edits.split("&"))
+    except ArgumentError as error:
+        raise ArgumentError(f"scene spec '{spec}': {error}") from None
+
+
+def parse_single(spec: str) -> tuple[int, str, list[str]]:
+    """Return seed, split and edits of a single apartment's spec."""
+    base, mark, edits = spec.partition("?")
+    match = re.fullmatch(APARTMENTS, base)
+    if match is None or match[4] is None:
+        raise ArgumentError(f"scene spec '{spec}': expected a single apartment, such as apartments:val/7.")
+    return int(match[4]), match[1], _parse_edits(spec, edits) if mark else []
+
+
+def _did_you_mean(spec: str) -> str:
+    """Return a hint at a split, or at a similar file next to the missing one."""
+    path = Path(spec).expanduser()
+    kind, colon, rest = spec.partition(":")
+    if did_you_mean(kind, ["apartments"]):
+        split = re.split("[:/]", rest)[0]
+        near = difflib.get_close_matches(split, ["train", "val", "test"], 1, 0.5) or ["val"]
+        meant = f"apartments:{near[0]}{rest[len(split) :]}"
+        return did_you_mean(spec, [meant]) if re.fullmatch(APARTMENTS, meant) else ""
+    if colon or not path.parent.is_dir():
+        return ""
+    return did_you_mean(path.name, [file.name for file in path.parent.iterdir()])
