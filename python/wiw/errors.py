@@ -79,7 +79,7 @@ class RegistryError(Error, LookupError):
 
 
 class ConstructionError(Error):
-    """A world model, a policy or another part cannot be made: its constructor failed.
+    """A world model, a policy or another part cannot be built: its constructor failed.
 
     `kind` is "raised", "deadline" where it did not return in time, or "ended" where it ended its process.
     """

@@ -352,7 +352,7 @@ def test_what_cannot_be_made(two_rooms):
         def __init__(self):
             raise OSError("no weights")
 
-    assert "It cannot be made: OSError: no weights (test_model_check.py" in str(found(Unmade, two_rooms)["raised"])
+    assert "It cannot be built: OSError: no weights (test_model_check.py" in str(found(Unmade, two_rooms)["raised"])
     with pytest.raises(RegistryError, match="Did you mean warp"):
         wiw.check_model("wrap", two_rooms)
     with pytest.raises(ArgumentError, match="no world model"):

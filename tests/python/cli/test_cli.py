@@ -251,7 +251,7 @@ def test_scaling_and_episodes_take_a_tasks_options_too(tmp_path, two_rooms, shor
     assert {each.name for each in tmp_path.iterdir()} >= {"notes.txt"} and not (tmp_path / "run.sqlite").exists()
     made = ["episodes", "ar", "--scenes", two_rooms, "--out", str(tmp_path / "ar.json")]
     assert main([*made, "--task-option", "categories=bathtub, coffee table"]) == 2
-    assert "holds nothing of the categories bathtub, coffee table" in capsys.readouterr().err
+    assert "has no object of the categories bathtub, coffee table" in capsys.readouterr().err
 
 
 def test_errors_are_one_clean_line(tmp_path, capsys):
@@ -481,7 +481,7 @@ def test_a_model_that_calls_exit_ends_no_command(tmp_path, two_rooms, short, cap
     code, said = ends("Quits")
     assert code == 1 and "1 infrastructure error, excluded from scores" in said and "SystemExit(0)" in said
     code, said = ends("Unmade")
-    assert code == 2 and "cannot be made: SystemExit: 0 (leaving.py, line 17)" in said and "Traceback" not in said
+    assert code == 2 and "cannot be built: SystemExit: 0 (leaving.py, line 17)" in said and "Traceback" not in said
     code, said = ends("Endless", "--deadline", "0.2")
     assert code == 2 and "did not return within 0.2 s" in said and "Traceback" not in said
     for model, kind in (("Quits", "raised"), ("Unmade", "raised"), ("Endless", "deadline")):

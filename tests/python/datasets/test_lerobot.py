@@ -451,7 +451,7 @@ def test_a_damaged_picture_stops_the_export(manipulation: Path, tmp_path: Path) 
     damaged = Demonstration(**{**vars(first), "encoded_images": (b"no picture", *first.encoded_images[1:])})
     facts = {name: value for name, value in shard.facts.items() if name not in ("format", "columns")}
     shards.write(path, [damaged, *rest], facts)
-    with pytest.raises(FileError, match="pictures of colour of 32 x 32, got something else"):
+    with pytest.raises(FileError, match="colour images of 32 x 32, got something else"):
         export_lerobot(bad, tmp_path / "out")
     assert sorted(path.name for path in tmp_path.iterdir()) == ["bad"]
 

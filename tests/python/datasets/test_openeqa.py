@@ -114,7 +114,7 @@ def test_a_start_of_the_list_is_checked_against_the_mesh(two_rooms: str, tmp_pat
         ({"answer": None}, "item 1: answer: expected text"),
         ({"question": ""}, "item 1: question: expected words"),
         ({"category": "colours"}, "item 1: category: expected one of"),
-        ({"question_id": "a1"}, "item 1: question_id 'a1' is that of item 0"),
+        ({"question_id": "a1"}, "item 1: question_id 'a1' is also that of item 0"),
         ({"question_id": ""}, "item 1: question_id: expected words"),
         ({"episode_history": 3}, "item 1: episode_history: expected text"),
         ({"extra_answers": "on the sofa"}, "item 1: extra_answers: expected a list"),

@@ -82,7 +82,7 @@ def test_foreign_texts_are_not_parsed(text: str) -> None:
         ("wheer", {}, "expected one of"),
         ("where", {}, "has the slots object"),
         ("where", {"object": "vase", "room": "kitchen"}, "has the slots object"),
-        ("where", {"object": "white board"}, "alone"),
+        ("where", {"object": "white board"}, "ambiguous"),
         ("where", {"object": "key on the wall"}, "distinguished from"),
         ("activity", {"activity": "fly"}, "distinguished from"),
         ("count_in", {"objects": "books", "room": "kitchen"}, "distinguished from"),

@@ -189,7 +189,7 @@ def test_construction_and_import_fail_by_kind(tmp_path) -> None:
         make_model(write("os._exit(4)"))
     with pytest.raises(RegistryError, match=r"cannot be loaded: ValueError: here \(made\.py, line 2\)"):
         make_model(write("raise ValueError('here')"))
-    with pytest.raises(ConstructionError, match="cannot be made: its process ended with SIGKILL") as caught:
+    with pytest.raises(ConstructionError, match="cannot be built: its process ended with SIGKILL") as caught:
         make_model(write(head + "    def __init__(self):\n        os.kill(os.getpid(), 9)\n"))
     assert caught.value.kind == "ended"
     with pytest.raises(ConstructionError, match=r"did not return within 0\.3 s") as caught:

@@ -149,7 +149,7 @@ def test_cancelled_jobs_end_and_keep_what_is_recorded(tmp_path, capsys):
     with pytest.raises(ArgumentError, match=r"is RUNNING \(1 active in all\); wait for them, or `wiw cancel"):
         submit_again = ["--live", 1, "--debug"]
         submit(out, *submit_again, scenes="slow", shards=1, episodes=40)
-    assert main(["cancel", str(out)]) == 0 and "told 1 jobs" in capsys.readouterr().out
+    assert main(["cancel", str(out)]) == 0 and "canceled 1 jobs" in capsys.readouterr().out
     wait_for(have_jobs_ended(out))
     found = wiw.status(out)
     assert 2 <= found.ended < 40 and found.stores[0].state == "stopped"

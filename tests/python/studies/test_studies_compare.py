@@ -51,7 +51,7 @@ def test_common_arms_are_paired_by_episode(runs):
 
 def test_it_says_what_differs_between_the_agents(runs):
     remarks = wiw.compare(*runs).remarks()
-    assert remarks[0] == "copy: same agent in both runs." and remarks[2] == "warp: drive 0.4 -> 0.8."
+    assert remarks[0] == "copy: the same agent in both runs." and remarks[2] == "warp: drive 0.4 -> 0.8."
 
 
 def test_an_arm_that_was_not_begun_is_compared_as_it_was_configured(runs, tmp_path):
@@ -61,7 +61,7 @@ def test_an_arm_that_was_not_begun_is_compared_as_it_was_configured(runs, tmp_pa
         store.execute("DELETE FROM decision WHERE arm = 'warp'")
         store.execute("DELETE FROM outcome WHERE arm = 'warp'")
         store.execute("UPDATE run SET info = json_remove(info, '$.built.warp')")
-    assert "warp: same agent in both runs." in wiw.compare(runs[0], stopped).remarks()
+    assert "warp: the same agent in both runs." in wiw.compare(runs[0], stopped).remarks()
     assert "warp: drive 0.4 -> 0.8." in wiw.compare(stopped, runs[1]).remarks()
 
 

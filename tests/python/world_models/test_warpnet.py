@@ -280,6 +280,6 @@ def test_the_demo_leaves_it_out_where_torch_is_missing(
     assert not capsys.readouterr().out
     monkeypatch.setattr("wiw.world_models.base.importlib.util.find_spec", lambda name: None)
     assert _choose_arms(names) == ["none", "copy", "warp", "oracle"]
-    assert "warpnet is left out: torch" in capsys.readouterr().out
+    assert "warpnet is skipped: torch" in capsys.readouterr().out
     assert [part.task for part in PARTS if _can_run(part)] == ["imagenav", "manipulation"]
-    assert "aeqa with policy explorer is left out: torch, safetensors not installed" in capsys.readouterr().out
+    assert "aeqa with policy explorer is skipped: torch, safetensors not installed" in capsys.readouterr().out

@@ -123,7 +123,7 @@ def _decode_thinned(encoded: bytes, feature: Feature) -> NDArray[Any]:
         kind = "depth" if feature.is_depth else "colour"
         got = "something else" if image is None else f"{image.dtype} {list(image.shape)}"
         raise FileError(
-            f"expected images of {kind} of {height} x {width}, got {got}; `wiw data verify` finds them in navigation "
+            f"expected {kind} images of {height} x {width}, got {got}; `wiw data verify` finds them in navigation "
             "datasets"
         )
     step = max(1, max(height, width) // THINNED_PIXELS) if max(height, width) >= LARGE_PIXELS else 1
