@@ -491,6 +491,7 @@ def _train_armnet(
     from wiw.datasets.demonstrations import read_manifest
     from wiw.networks import single_thread
     from wiw.training import armnet as training
+    from wiw.training.armnet_events import evaluate_events
     from wiw.training.checkpoint import Checkpoint
     from wiw.training.plays import gather_plays, merge_plays, read_demonstration_plays
     from wiw.world_models.armnet.weights import load, save
@@ -510,7 +511,7 @@ def _train_armnet(
     card["recipe"] = asdict(recipe)
     save(out, network, card)  # before the evaluation, which takes another minute
     network = load(out)[0]  # as it is stored, in half precision
-    card["held_out"] = training.evaluate(network, held_out)
+    card["held_out"] = training.evaluate(network, held_out) | {"events": evaluate_events(network, held_out)}
     save(out, network, card)
     checkpoint.remove()
     _report_armnet(card)
@@ -635,6 +636,19 @@ def _report_armnet(card: dict[str, Any]) -> None:
         ]
         print(f"  {name:<18}" + "".join(cells))
     print("mean absolute error (of 255) of changed pixels, and PSNR in dB of the window around the table")
+    print(f"{'thing':<20}{'the next pose':>30}{'all poses in a row':>30}")
+    events = held_out["events"]
+    for name, one_pose in events["one_pose"].items():
+        cells = [_format_event(figures) for figures in (one_pose, events["free_running"].get(name, {}))]
+        print(f"  {name:<18}" + "".join(f"{cell:>30}" for cell in cells))
+    print("mean absolute error (of 255) of each thing, before -> after training, its sharpness, lamps of the right colour")
+
+
+def _format_event(figures: Mapping[str, float]) -> str:
+    if not figures:
+        return "-"
+    right = f" {100 * figures['right']:3.0f} %" if "right" in figures else ""
+    return f"{figures['arm']:.1f} -> {figures['armnet']:.1f} {figures['sharpness']:.2f}{right}"
 
 
 def _show_bar(items: Any, text: str, total: int) -> Any:
