@@ -166,9 +166,7 @@ def test_things_are_where_they_are_seen(plays: Plays) -> None:
 
 
 @pytest.mark.parametrize(("lamps", "right"), [("true", (1, 1, 1)), ("amber", (0, 1, 0)), ("off", (0, 0, 0))])
-def test_events_are_measured_by_themselves(
-    lamps: str, right: tuple[int, ...], monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_events_are_measured_by_themselves(lamps: str, right: tuple[int, ...], monkeypatch: pytest.MonkeyPatch) -> None:
     """Of views that are true but for the lamps: errors where these light up and nowhere else."""
     pushes = [record_plays(1000, number, 1) for number in (0, 8)]
     shown = merge_plays(pushes)
@@ -193,7 +191,9 @@ def test_events_are_measured_by_themselves(
             if lamps == "true":
                 assert figures["armnet"] == 0 and abs(figures["sharpness"] - 1) < 1e-4
         if lamps == "amber":
-            assert mode["lit second"]["armnet"] < 0.5 * min(mode[f"lit {turn}"]["armnet"] for turn in ("first", "third"))
+            assert mode["lit second"]["armnet"] < 0.5 * min(
+                mode[f"lit {turn}"]["armnet"] for turn in ("first", "third")
+            )
 
 
 def test_figures_are_those_of_a_model_that_knows_the_arm_and_no_more(plays: Plays) -> None:

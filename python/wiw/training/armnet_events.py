@@ -31,12 +31,12 @@ def evaluate_events(network: Network, plays: Plays) -> dict[str, Any]:
     """Measure a network's views by what becomes of each thing at a pose.
 
     Returns:
-        {"one_pose": {event: figures}, "free_running": {event: figures}}: each pose by itself, from the true view before
-        it; and all poses in a row, from a play's first view. The events are `EVENTS`. The figures are "count", the number
-        of things; "arm" and "armnet", the mean absolute error, in units of 1/255, where the thing is before or after the
-        pose, of the view if nothing but the arm had moved, and of the network's; "sharpness", the differences between
-        neighbouring pixels there as a share of the true ones; and for lamps "lit", the number that the true view shows,
-        with "right", the share of them that the network's view shows in the right colour.
+        {"one_pose": {event: figures}, "free_running": {event: figures}}: each pose by itself, from the true view
+        before it; and all poses in a row, from a play's first view. The events are `EVENTS`. The figures are "count",
+        the number of things; "arm" and "armnet", the mean absolute error, in units of 1/255, where the thing is before
+        or after the pose, of the view if nothing but the arm had moved, and of the network's; "sharpness", the
+        differences between neighbouring pixels there as a share of the true ones; and for lamps "lit", the number that
+        the true view shows, with "right", the share of them that the network's view shows in the right colour.
     """
     one_pose, free_running = (defaultdict[str, dict[str, list[float]]](lambda: defaultdict(list)) for _ in range(2))
     plate = load_bare_table()
