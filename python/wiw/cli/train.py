@@ -641,9 +641,7 @@ def _report_armnet(card: dict[str, Any]) -> None:
     for name, one_pose in events["one_pose"].items():
         cells = [_format_event(figures) for figures in (one_pose, events["free_running"].get(name, {}))]
         print(f"  {name:<18}" + "".join(f"{cell:>30}" for cell in cells))
-    print(
-        "mean absolute error (of 255) of each thing, before -> after training, its sharpness, lamps of the right colour"
-    )
+    print("mean absolute error (of 255) of each thing, arm alone -> armnet; sharpness; lamps of the right colour")
 
 
 def _format_event(figures: Mapping[str, float]) -> str:
