@@ -21,7 +21,7 @@ from wiw._core import core
 from wiw.datasets.demonstrations import Demonstration, Demonstrations
 from wiw.tabletop.base import DOWN, TableSetup, TabletopTask
 from wiw.tabletop.tasks import TABLETOP_TASKS
-from wiw.tabletop.workbench import TABLE, Workbench
+from wiw.tabletop.workbench import LAMPS, TABLE, Workbench
 from wiw.training.gather import Arrays, Job, ProgressBar, gather_arrays
 from wiw.world_models.armnet.body import render_arm
 from wiw.world_models.armnet.network import FRONT, WINDOW
@@ -32,6 +32,14 @@ MAX_SKIPPED = 5
 """Most poses executed before the first view."""
 PLAYS_PER_FILE = 25
 """Plays in a cache file."""
+EVENTS = ("still", "lit first", "lit second", "lit third", "carried", "placed", "pushed")
+"""What can become of a thing at a pose: nothing; it is a button whose lamp changes to the colour of the first, second,
+or third and later push; it is in the gripper and moves; it was in the gripper, which lets go of it; it moves otherwise.
+"""
+MAX_THINGS = 5
+"""Most things on a table."""
+MOVED, TURNED = 0.005, 0.1
+"""Metres, or radians, from which on a thing has moved."""
 
 
 @dataclass(frozen=True)
@@ -46,12 +54,16 @@ class Plays:
     """[N, 9, h, w]: the pixels that the arm covers."""
     poses: NDArray[np.float64]
     """[N, 9, 7]: the poses that the gripper reached."""
+    things: NDArray[np.uint8]
+    """[N, 9, h, w]: the thing that each pixel shows, from 1; 0: none, or not recorded. For evaluation only."""
+    events: NDArray[np.uint8]
+    """[N, 8, 5]: what became of each thing at each pose, as its place in `EVENTS`. For evaluation only."""
 
     def __len__(self) -> int:
         return len(self.views)
 
 
-FILE_FIELDS = ("seen", "bare", "arm", "poses")
+FILE_FIELDS = ("seen", "bare", "arm", "poses", "things", "events")
 """Names of the arrays of `Plays` in cache files, in the order of its fields."""
 
 
@@ -66,7 +78,7 @@ def gather_plays(count: int, seed: int, folder: Path, workers: int, bar: Progres
     Raises:
         FileError: the folder cannot be written.
     """
-    job = Job(f"{count} plays", FILE_FIELDS, partial(_build_chunk, seed=seed), ("plays", 1, seed))
+    job = Job(f"{count} plays", FILE_FIELDS, partial(_build_chunk, seed=seed), ("plays", 2, seed))
     chunks = {str(number): f"plays {number}" for number in range(-(-count // PLAYS_PER_FILE))}
     found = gather_arrays(chunks, job, folder, workers, bar)
     return Plays(*(np.concatenate([part[name] for part in found])[:count] for name in FILE_FIELDS))
@@ -74,7 +86,7 @@ def gather_plays(count: int, seed: int, folder: Path, workers: int, bar: Progres
 
 def _build_chunk(name: str, seed: int) -> Arrays:
     plays = record_plays(seed, PLAYS_PER_FILE * int(name), PLAYS_PER_FILE)
-    return dict(zip(FILE_FIELDS, (plays.views, plays.bare, plays.arm, plays.poses), strict=True))
+    return dict(zip(FILE_FIELDS, (getattr(plays, each.name) for each in fields(Plays)), strict=True))
 
 
 def record_plays(seed: int, first: int, count: int) -> Plays:
@@ -122,14 +134,45 @@ def _record_play(rng: np.random.Generator, number: int) -> Plays:
 
     for _ in range(int(rng.integers(MAX_SKIPPED + 1))):
         execute_next()
-    commanded, views = [bench.pose], [_render_window(bench)]
-    for _ in range(POSES):
+    commanded, frames = [bench.pose], [_render_window(bench)]
+    events = np.zeros((POSES, MAX_THINGS), np.uint8)
+    for at in range(POSES):
+        before = bench.fork()
         commanded.append(execute_next())
-        views.append(_render_window(bench))
-    return _build_play(np.stack(views), np.stack(commanded))
+        frames.append(_render_window(bench))
+        events[at, : len(bench.things)] = find_events(before, bench)
+    views, things = (np.stack(part) for part in zip(*frames, strict=True))
+    return _build_play(views, np.stack(commanded), things, events)
 
 
-def _build_play(views: NDArray[np.uint8], commanded: NDArray[np.float64]) -> Plays:
+def find_events(before: Workbench, after: Workbench) -> list[int]:
+    """Return what has become of each thing between two states of a workbench, as its place in `EVENTS`."""
+    found = []
+    for name in after.things:
+        moved = np.linalg.inv(before.get_pose(name)) @ after.get_pose(name)
+        far = np.linalg.norm(moved[:3, 3]) > MOVED or np.arccos(np.clip((np.trace(moved) - 2) / 2, -1, 1)) > TURNED
+        lamp = _find_lamp(after, name)
+        if lamp != _find_lamp(before, name):
+            event = EVENTS[lamp]
+        elif name == before.held_object:
+            event = "placed" if after.held_object is None else "carried" if far else "still"
+        else:
+            event = "pushed" if far else "still"
+        found.append(EVENTS.index(event))
+    return found
+
+
+def _find_lamp(bench: Workbench, name: str) -> int:
+    """Return which lamp of a button is on, from 1, or 0: that of its latest push."""
+    return min(max((n for n, pushed in enumerate(bench.pressed_buttons, 1) if pushed == name), default=0), len(LAMPS))
+
+
+def _build_play(
+    views: NDArray[np.uint8],
+    commanded: NDArray[np.float64],
+    things: NDArray[np.uint8] | None = None,
+    events: NDArray[np.uint8] | None = None,
+) -> Plays:
     """Return one play, with renderings of the arm alone at the same poses."""
     arms = list(render_arm(commanded, FRONT))
     return Plays(
@@ -137,12 +180,17 @@ def _build_play(views: NDArray[np.uint8], commanded: NDArray[np.float64]) -> Pla
         np.stack([arm.color[WINDOW] for arm in arms])[None],
         np.stack([arm.arm[WINDOW] for arm in arms])[None],
         np.stack([arm.pose for arm in arms])[None],
+        (np.zeros(views.shape[:-1], np.uint8) if things is None else things)[None],
+        (np.zeros((len(views) - 1, MAX_THINGS), np.uint8) if events is None else events)[None],
     )
 
 
-def _render_window(bench: Workbench) -> NDArray[np.uint8]:
-    view: NDArray[np.uint8] = bench.render_view("front", FRONT)["color"][WINDOW]
-    return view
+def _render_window(bench: Workbench) -> tuple[NDArray[np.uint8], NDArray[np.uint8]]:
+    """Return the view in the network's window, and the thing, from 1, that each of its pixels shows."""
+    seen = bench.render_view("front", FRONT, ("color", "instance"))
+    numbers = {name: number for number, name in enumerate(bench.things, 1)}
+    of_instance = np.array([0, *(numbers.get(name, 0) for name in bench.instance_names)], np.uint8)
+    return seen["color"][WINDOW], of_instance[seen["instance"][WINDOW]]
 
 
 def _plan_as_expert(

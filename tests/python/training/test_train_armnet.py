@@ -3,6 +3,7 @@
 
 from __future__ import annotations
 
+from dataclasses import fields, replace
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -12,7 +13,10 @@ import pytest
 
 from wiw.cli.app import main
 from wiw.errors import ArgumentError
-from wiw.tabletop.workbench import TABLE
+from wiw.tabletop.colours import compare_colour
+from wiw.tabletop.push_buttons import UNLIT_COLOUR
+from wiw.tabletop.tasks import TABLETOP_TASKS
+from wiw.tabletop.workbench import LAMPS, TABLE
 
 torch = pytest.importorskip("torch", reason="needs wiw[torch]")
 
@@ -27,12 +31,16 @@ from wiw.training.armnet import (  # noqa: E402
     sample_sequences,
     train,
 )
+from wiw.training.armnet_events import evaluate_events  # noqa: E402
 from wiw.training.checkpoint import Checkpoint  # noqa: E402
 from wiw.training.plays import (  # noqa: E402
+    EVENTS,
     POSES,
     Plays,
     corrupt_plan,
+    find_events,
     gather_plays,
+    merge_plays,
     read_demonstration_plays,
     record_plays,
 )
@@ -53,8 +61,8 @@ def plays() -> Plays:
 
 def test_a_play_is_a_function_of_its_number(plays: Plays) -> None:
     again = record_plays(0, 2, 1)
-    for name in ("views", "bare", "arm", "poses"):
-        np.testing.assert_array_equal(getattr(again, name)[0], getattr(plays, name)[2])
+    for each in fields(Plays):
+        np.testing.assert_array_equal(getattr(again, each.name)[0], getattr(plays, each.name)[2])
     assert plays.views.shape == (4, POSES + 1, *np.zeros((160, 160))[WINDOW].shape, 3) == plays.bare.shape
     assert plays.arm.dtype == np.bool_ and 0.01 < plays.arm.mean() < 0.3
     hidden = np.abs(plays.views.astype(int) - plays.bare).max(axis=-1)[plays.arm]
@@ -116,7 +124,7 @@ def test_the_same_lesson_gives_the_same_network_stopped_or_not(plays: Plays, tmp
 
 def test_training_teaches_what_becomes_of_things(plays: Plays) -> None:
     """By heart, of one play: it is nearer to what changes than one who leaves things alone."""
-    one = Plays(*(getattr(plays, name)[:1] for name in ("views", "bare", "arm", "poses")))
+    one = Plays(*(getattr(plays, each.name)[:1] for each in fields(Plays)))
     network, _ = train(one, Recipe(epochs=40, batch=4, steps=2, free=0, widths=SMALL, rate=5e-3))
     batch = build_sequences(one, np.zeros(7, np.int64), np.arange(7), 1)
     with torch.inference_mode():
@@ -124,6 +132,68 @@ def test_training_teaches_what_becomes_of_things(plays: Plays) -> None:
         changed = (step.target - step.static_view).abs().amax(1, keepdim=True) > CHANGE_THRESHOLD
         wrong, alone = (((view - step.target).abs() * changed).sum() for view in (step.prediction, step.static_view))
     assert wrong < 0.95 * alone
+
+
+def find_plan_events(name: str) -> tuple[Any, list[str]]:
+    """Return an expert's target, and what becomes of things at its poses, one after another."""
+    task = TABLETOP_TASKS[name]
+    setup = task.create_setup(3, 2)
+    bench, found = setup.build_workbench(), []
+    for pose in task.plan_expert(bench.get_poses(setup.objects), setup.target, bench.pose):
+        before = bench.fork()
+        bench.move_to(pose)
+        events = zip(bench.things, find_events(before, bench), strict=True)
+        found += [f"{thing} {EVENTS[event]}" for thing, event in events if event]
+    return setup.target, found
+
+
+def test_events_are_what_becomes_of_each_thing() -> None:
+    assert find_plan_events("slide_block")[1] == ["block pushed"]
+    buttons, found = find_plan_events("push_buttons")
+    assert found == [f"{button} lit {turn}" for button, turn in zip(buttons, ("first", "second", "third"), strict=True)]
+    base, found = find_plan_events("stack_cups")
+    first, second = (each.split()[0] for each in found if each.endswith("placed"))
+    assert base not in (first, second) and first != second
+    assert [each for each in found if each.startswith(first)][:3] == [f"{first} carried"] * 2 + [f"{first} placed"]
+
+
+def test_things_are_where_they_are_seen(plays: Plays) -> None:
+    """A press play's rings, by their own dark colour, are within the pixels of buttons, and the arm is not."""
+    things, views = plays.things[0, 0], plays.views[0, 0].astype(int)
+    assert set(np.unique(things)) == {0, 1, 2, 3} and not things[:10].any()
+    dark = (views.max(axis=-1) < 75) & ~plays.arm[0, 0]
+    assert np.mean(things[dark] > 0) > 0.9
+
+
+@pytest.mark.parametrize(("lamps", "right"), [("true", (1, 1, 1)), ("amber", (0, 1, 0)), ("off", (0, 0, 0))])
+def test_events_are_measured_by_themselves(lamps: str, right: tuple[int, ...], monkeypatch: pytest.MonkeyPatch) -> None:
+    """Of views that are true but for the lamps: errors where these light up and nowhere else."""
+    pushes = [record_plays(1000, number, 1) for number in (0, 8)]
+    shown = merge_plays(pushes)
+    assert {1, 2, 3} <= set(shown.events.ravel().tolist())
+
+    def predict(network: Network, sequences: Any) -> Any:
+        for step in predict_free_running(network, sequences):
+            made = step.target.permute(0, 2, 3, 1).clone()
+            for colour in LAMPS.values():
+                likeness = compare_colour((made * 255).round().byte().numpy(), colour)
+                new = {"true": made, "amber": torch.tensor(LAMPS["amber"]), "off": torch.tensor(UNLIT_COLOUR)}[lamps]
+                made = torch.where(torch.from_numpy(likeness > 0.45)[..., None], new, made).float()
+            yield replace(step, prediction=made.permute(0, 3, 1, 2))
+
+    monkeypatch.setattr("wiw.training.armnet_events.predict_free_running", predict)
+    found = evaluate_events(Network(SMALL), shown)
+    for mode in found.values():
+        assert [mode[f"lit {turn}"]["right"] for turn in ("first", "second", "third")] == list(right)
+        for event, figures in mode.items():
+            assert figures["count"] == (shown.events == EVENTS.index(event)).sum() or event == "still"
+            assert figures["arm"] > 20 or event == "still"
+            if lamps == "true":
+                assert figures["armnet"] == 0 and abs(figures["sharpness"] - 1) < 1e-4
+        if lamps == "amber":
+            assert mode["lit second"]["armnet"] < 0.5 * min(
+                mode[f"lit {turn}"]["armnet"] for turn in ("first", "third")
+            )
 
 
 def test_figures_are_those_of_a_model_that_knows_the_arm_and_no_more(plays: Plays) -> None:
@@ -138,7 +208,7 @@ def test_figures_are_those_of_a_model_that_knows_the_arm_and_no_more(plays: Play
 
 def test_plays_are_kept(tmp_path: Path, plays: Plays, monkeypatch: pytest.MonkeyPatch) -> None:
     def record(seed: int, first: int, count: int) -> Plays:
-        return Plays(*(getattr(plays, name)[first : first + count] for name in ("views", "bare", "arm", "poses")))
+        return Plays(*(getattr(plays, each.name)[first : first + count] for each in fields(Plays)))
 
     monkeypatch.setattr("wiw.training.plays.record_plays", record)
     monkeypatch.setattr("wiw.training.plays.PLAYS_PER_FILE", 2)
@@ -170,13 +240,14 @@ def test_demonstrations_are_plays_too(tmp_path: Path, plays: Plays) -> None:
 def test_the_command_makes_a_model(
     tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr("wiw.training.armnet.HELD_OUT", 4)
+    monkeypatch.setattr("wiw.training.armnet_weights.HELD_OUT", 4)
     monkeypatch.setattr("wiw.training.plays.PLAYS_PER_FILE", 4)
     monkeypatch.setattr("wiw.training.armnet.Recipe", partial(Recipe, widths=SMALL, rate=5e-3))
     out, cache = tmp_path / "weights.safetensors", tmp_path / "plays"
     command = ["train", "armnet", "--plays", "4", "--epochs", "12", "--out", str(out), "--cache", str(cache)]
     assert main([*command, "--workers", "1"]) == 0
-    assert "poses ahead" in capsys.readouterr().out
+    said = capsys.readouterr().out
+    assert "poses ahead" in said and "all poses in a row" in said and "  still " in said
     card = ArmNet(out).card
     assert card["plays"] == 4 and card["recipe"]["epochs"] == 12
     held_out = gather_plays(4, HELD_OUT_SEED_OFFSET, cache, 1, lambda items, text, total: items)
@@ -202,10 +273,10 @@ def test_the_command_goes_on_only_with_the_same_demonstrations_and_until_all_is_
 
     demos, out = tmp_path / "demos", tmp_path / "w"
     demos.mkdir()
-    monkeypatch.setattr("wiw.training.plays.gather_plays", lambda *_, **__: plays)
-    monkeypatch.setattr("wiw.training.plays.read_demonstration_plays", lambda folder: plays)
-    monkeypatch.setattr("wiw.training.armnet.train", learnt)
-    monkeypatch.setattr("wiw.training.armnet.evaluate", stopped)
+    monkeypatch.setattr("wiw.training.armnet_weights.gather_plays", lambda *_, **__: plays)
+    monkeypatch.setattr("wiw.training.armnet_weights.read_demonstration_plays", lambda folder: plays)
+    monkeypatch.setattr("wiw.training.armnet_weights.train", learnt)
+    monkeypatch.setattr("wiw.training.armnet_weights.evaluate", stopped)
     command = ["train", "armnet", "--out", str(out), "--demonstrations", str(demos)]
     (demos / "manifest.json").write_text('{"tasks": ["slide_block"], "episodes": 1, "seed": 0}')
     assert main(command) == 130

@@ -12,6 +12,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from locations import ROOT
 
 import wiw
 from wiw.errors import DependencyError, WeightsError
@@ -26,6 +27,7 @@ torch = pytest.importorskip("torch", reason="needs wiw[torch]")
 from safetensors import safe_open  # noqa: E402
 from safetensors.torch import save as packed  # noqa: E402
 
+from wiw.training.plays import EVENTS  # noqa: E402
 from wiw.world_models.armnet.body import render_arm, render_bare_table  # noqa: E402
 from wiw.world_models.armnet.model import BUILT_IN, SIZE, ArmNet  # noqa: E402
 from wiw.world_models.armnet.motion import motion  # noqa: E402
@@ -317,3 +319,25 @@ def test_the_readme_tells_the_figures_of_the_weights() -> None:
         made = [f"{held_out['changed'][name][k]:.1f} / {held_out['psnr'][name][k]:.1f}" for k in ("1", "2", "3", "5")]
         assert [each.strip() for each in told] == made
     assert any(f"{held_out['plays']} plays at tables that it never saw" in line for line in lines)
+
+
+def test_the_results_tell_its_figures_by_event() -> None:
+    events = ArmNet().card["held_out"]["events"]
+    lines = (ROOT / "docs" / "results.md").read_text().splitlines()
+    rows = (
+        "stays where it is",
+        "lights up lime: the first push",
+        "lights up amber: the second",
+        "lights up red: the third, or later",
+        "is carried",
+        "is let go",
+        "is pushed",
+    )
+    for event, row in zip(EVENTS, rows, strict=True):
+        one_pose, free_running = (events[mode][event] for mode in ("one_pose", "free_running"))
+        made = [str(one_pose["count"])]
+        for figures in (one_pose, free_running):
+            right = f" / {100 * figures['right']:.0f} %" if "right" in figures else ""
+            made += [f"{figures['arm']:.1f}", f"{figures['armnet']:.1f} / {figures['sharpness']:.2f}{right}"]
+        told = next(line for line in lines if line.startswith(f"| {row} |")).split("|")[2:-1]
+        assert [each.strip() for each in told] == made
