@@ -156,7 +156,7 @@ def test_damaged_missing_and_foreign_files_are_found(copied: Path) -> None:
 def test_datasets_that_share_a_scene_leak(collected: Path, copied: Path, tmp_path: Path, two_rooms: str) -> None:
     found = verify_datasets([collected, copied])
     assert any(f"two_rooms is in {collected} and in {copied}" in each for each in found.problems["leak"])
-    assert any("pictures are in two_rooms" in each for each in found.problems["leak"])
+    assert any("images are in two_rooms" in each for each in found.problems["leak"])
     few = {**SMALL, "rules": {**RULES, "max_scene_frames": 30}}
     other = tmp_path / "renamed.obj"
     shutil.copy(two_rooms, other)
@@ -265,9 +265,9 @@ def test_the_command_line(tmp_path: Path, two_rooms: str, capsys: pytest.Capture
         (["collect", "navigation", "--scenes", "apartments:val:2"], "expected scenes of a train split"),
         (["collect", "navigation", "--rule", "spacin=2"], "spacin"),
         (["collect", "navigation", "--rule", "spacing=-2"], "spacing above 0"),
-        (["data", "stats", "nowhere"], "meta.json is missing"),
-        (["data", "verify", "nowhere"], "meta.json is missing"),
-        (["data", "show", "nowhere"], "meta.json is missing"),
+        (["data", "stats", "nowhere"], "meta.json does not exist"),
+        (["data", "verify", "nowhere"], "meta.json does not exist"),
+        (["data", "show", "nowhere"], "meta.json does not exist"),
     ],
 )
 def test_what_cannot_be_is_told(arguments: list[str], words: str, capsys: pytest.CaptureFixture[str]) -> None:

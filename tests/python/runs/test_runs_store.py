@@ -192,7 +192,7 @@ def test_an_existing_run_is_not_overwritten(run):
 
 def test_a_creation_that_was_cut_off_is_done_again(tmp_path):
     (tmp_path / "run.sqlite").touch()
-    with pytest.raises(StoreError, match="cut off"):
+    with pytest.raises(StoreError, match="interrupted"):
         RunStore.read(tmp_path)
     with RunStore.create(tmp_path, CONFIG, INFO, LineTask().episodes(2)) as store:
         assert store.pending("none") == [0, 1]

@@ -647,7 +647,7 @@ def test_another_version_is_refused_at_the_handshake():
 
     with serve_sync(another, "127.0.0.1", 0) as old:
         threading.Thread(target=old.serve_forever, daemon=True).start()
-        with pytest.raises(RemoteError, match="speaks version 1 of the protocol, the other one 9") as caught:
+        with pytest.raises(RemoteError, match="speaks version 1 of the protocol, the other 9") as caught:
             Remote(f"ws://127.0.0.1:{old.socket.getsockname()[1]}")
         assert caught.value.kind == "version"
         old.shutdown()

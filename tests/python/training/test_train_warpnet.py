@@ -112,5 +112,5 @@ def test_the_command_makes_a_model_that_beats_the_floor(
 def test_scenes_without_room_ahead_are_told(two_rooms: str, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("wiw.training.warpnet.find_straight_paths", lambda *_: [])
     model = WarpNet.of(Network(8, (4, 4, 4)))
-    with pytest.raises(ArgumentError, match=r"1\.6 m free"):
+    with pytest.raises(ArgumentError, match=r"nowhere is 1\.6 m of free floor ahead"):
         evaluate(model, two_rooms, 0)

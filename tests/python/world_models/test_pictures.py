@@ -31,7 +31,7 @@ def draw(warmth: float, detail: float, seed: int) -> NDArray[np.uint8]:
 def test_exchanged_colours_are_found_in_ends_too(shared: int) -> None:
     seen = draw(40, 5, 0)
     frames = np.stack([seen, *[seen[..., ::-1]] * 4])[None]
-    with pytest.raises(ContractError, match="after frame 0, red and blue are exchanged"):
+    with pytest.raises(ContractError, match="after frame 0, red and blue are swapped"):
         check_pictures("model", sample(seen[None]), frames, [make_control(shared)])
 
 
