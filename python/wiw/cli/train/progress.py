@@ -43,19 +43,23 @@ class TrainingProgress:
         if self._first is None:  # the first step warms up, and comes after data and weights were loaded
             self._first, self._began = step, now
             self._bars.__enter__()
-        done = step - self._first
+        if sys.stderr.isatty() or now - self._said >= LINE_SECONDS or step == steps:
+            self._show(step, steps, loss, now)
+        if step == steps:
+            self._bars.__exit__()
+
+    def _show(self, step: int, steps: int, loss: float, now: float) -> None:
+        done = step - (self._first or 0)
         rate = done / (now - self._began) if done else 0.0
         text = (
             f"step {step:,}/{steps:,}, loss {loss:.4f}, {rate * self._batch:.2f} {self._unit}/s, {_describe_memory()}"
         )
         if sys.stderr.isatty():
             self._bars.show("training", step, steps, text)
-        elif now - self._said >= LINE_SECONDS or step == steps:
-            left = f", {(steps - step) / rate / 60:.0f} min left" if rate and step < steps else ""
-            print(f"training: {text}{left}", file=sys.stderr, flush=True)
-            self._said = now
-        if step == steps:
-            self._bars.__exit__()
+            return
+        left = f", {(steps - step) / rate / 60:.0f} min left" if rate and step < steps else ""
+        print(f"training: {text}{left}", file=sys.stderr, flush=True)
+        self._said = now
 
 
 def describe_validation(found: Mapping[str, float]) -> str:
