@@ -65,7 +65,7 @@ class Target:
 
 @dataclass(frozen=True)
 class Answer:
-    """What an agent believes at a decision: a distribution over the goal's choices."""
+    """An agent's belief at a decision: a distribution over the goal's choices."""
 
     choices: tuple[str, ...]
     probabilities: NDArray[np.float64]
@@ -88,7 +88,7 @@ class Answer:
 
 @dataclass(frozen=True)
 class TextAnswer:
-    """What an agent believes at a decision, in words, if the goal is a question."""
+    """An agent's belief at a decision, in words, if the goal is a question."""
 
     text: str = ""
     """Empty while the agent believes nothing."""
@@ -107,7 +107,7 @@ class Outlook(Protocol):
 
 @dataclass(frozen=True)
 class Observation:
-    """What the agent perceives: images, odometry since the start of the episode, and depth if the run grants it.
+    """The agent's perception: images, odometry since the start of the episode, and depth if the run grants it.
 
     Nothing here reveals where in the scene the agent is: poses are relative to the first observation of the episode.
     """
@@ -194,7 +194,7 @@ class CameraView:
 
 @dataclass(frozen=True)
 class ArmObservation:
-    """What a manipulator perceives; its goals are given in words and its plans are poses."""
+    """A manipulator's perception; its goals are given in words and its plans are poses."""
 
     front: NDArray[np.uint8]
     """uint8 [480, 480, 3]: the fixed camera in front of the table."""
@@ -263,7 +263,7 @@ class Wording:
 
 @dataclass(frozen=True)
 class TableSpec:
-    """What the tables and plots of a task's runs show, besides each arm's metrics."""
+    """Contents of the tables and plots of a task's runs, besides each arm's metrics."""
 
     kinds: tuple[str, ...] = ("success",)
     """Metrics shown for each kind of episode, if there are several kinds."""
@@ -273,7 +273,7 @@ class TableSpec:
     """Numbers of primitives at which the anytime curve is read, from metrics such as "score_at_30"; if empty, the curve
     is success over decisions."""
     kind: str = "kind of task"
-    """What a kind is called."""
+    """The word for a kind."""
 
 
 @dataclass(frozen=True)
@@ -390,7 +390,7 @@ def _pad_actions(actions: NDArray[Any], longest: int) -> NDArray[Any]:
 
 @dataclass(frozen=True)
 class Conditioning:
-    """What a world model sees, batched over candidates and episodes. Besides `image`, only what `accepts.needs` lists
+    """Input of a world model, batched over candidates and episodes. Besides `image`, only what `accepts.needs` lists
     is set.
     """
 
@@ -436,7 +436,7 @@ class Rollout:
 
 @dataclass(frozen=True)
 class Fidelity:
-    """What would really have been seen along each plan of a decision. Privileged, like `Truth`."""
+    """True views along each plan of a decision. Privileged, like `Truth`."""
 
     rollouts: tuple[Rollout, ...]
     scores: NDArray[np.float64]
@@ -494,11 +494,11 @@ class Decision:
     """Wall time by stage: propose, platform, world_model, cache, revise, environment (execution). Episodes decided in
     one batch share the time equally."""
     calls: Mapping[str, int] = field(default_factory=dict)
-    """What this decision requested, independent of batching: calls of the world model (at most one per level of the
+    """Requests of this decision, independent of batching: calls of the world model (at most one per level of the
     beam search), and the rows and frames of its rollouts."""
     note: str = ""
     answer: Answer | TextAnswer | None = None
-    """What the agent believes now, if the goal has choices or is a question."""
+    """The agent's present belief, if the goal has choices or is a question."""
     fidelity: Fidelity | None = None
     """How faithful imagination was, if the run measures it."""
     spent: Mapping[str, float] = field(default_factory=dict)
@@ -507,9 +507,9 @@ class Decision:
     vlm_cached, vlm_retries, vlm_input_tokens, vlm_output_tokens, and vlm_usd if its price is known.
     """
     exchanges: tuple[Exchange, ...] = ()
-    """What a language model was asked, and what it answered."""
+    """Questions to a language model, and its answers."""
     pictures: Mapping[str, NDArray[np.uint8]] = field(default_factory=dict)
-    """What the policies believe, uint8 [H, W, 3] by name (`Policy.draw`); empty if the record keeps no images."""
+    """Pictures of beliefs, uint8 [H, W, 3] by name (`Policy.draw`); empty if the record keeps no images."""
 
 
 @dataclass(frozen=True)

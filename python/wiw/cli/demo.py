@@ -25,7 +25,7 @@ class Part:
     arms: tuple[str, ...]
     episodes: int
     about: str
-    """What happens, as the beginning of a sentence that ends with the number of world models."""
+    """The story, as the beginning of a sentence that ends with the number of world models."""
     more: str
     """A command for more of the same."""
     options: dict[str, Any] = field(default_factory=dict)

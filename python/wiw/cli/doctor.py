@@ -19,7 +19,7 @@ class Finding:
     name: str
     detail: str
     remedy: str = ""
-    """What to do; empty if nothing is wrong."""
+    """The remedy; empty if nothing is wrong."""
 
 
 def doctor() -> int:

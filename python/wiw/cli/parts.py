@@ -41,7 +41,7 @@ class TaskFlags:
     scene_folder: Folder = None
     """Folder that the scene paths in that file are relative to. Default for files of wiw: the file's own folder."""
     motion: Literal["refuse", "slide"] | None = None
-    """What happens to blocked moves. Default: the preset's rule."""
+    """Treatment of blocked moves. Default: the preset's rule."""
     robot: Annotated[Path | None, arg(metavar="URDF")] = None
     """For manipulation: description of the robot arm. Default: the Franka Panda, in simple shapes."""
     preset: Annotated[str | None, arg(metavar="NAME|FILE")] = None

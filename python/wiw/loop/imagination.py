@@ -64,7 +64,7 @@ class Imagination(ABC):
     rollouts: Sequence[Sequence[Rollout] | None]
     """[episode][candidate]; None for an episode of which nothing was imagined."""
     costs: Sequence[Mapping[str, int]]
-    """What each episode requested: consultations, rows and frames."""
+    """Requests of each episode: consultations, rows and frames."""
     view: View = "perspective"
     """That the model imagines."""
     source_size: tuple[int, int] | None = None

@@ -36,7 +36,7 @@ class Check:
     """SHA-256 of everything that was decided and measured, in hexadecimal."""
     again: str
     difference: str
-    """What differs first, e.g. "decision 3: scores: recorded [0.25,0.5], now [0.25,0.75]"; empty if nothing does."""
+    """The first difference, e.g. "decision 3: scores: recorded [0.25,0.5], now [0.25,0.75]"; empty if there is none."""
 
     @property
     def same(self) -> bool:

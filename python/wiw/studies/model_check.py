@@ -100,7 +100,7 @@ class Finding:
     """"needs", "raised", "deadline", the kind of a `ContractError`, "frame 0", "pictures", "training", "random",
     "batch", "causal", "history", "plan", "inputs", "memory", "describe", "version", or "slow"."""
     text: str
-    """What is wrong, what was seen, and what to do."""
+    """The fault, the evidence, and the remedy."""
     serious: bool = True
     """Whether the contract is broken; otherwise it is only a note."""
 

@@ -46,7 +46,7 @@ class Task(ABC):
     wording: Wording = Wording()
     """The words that reports use for its episodes."""
     tables: TableSpec = TableSpec()
-    """What the tables and plots of its runs show."""
+    """Contents of the tables and plots of its runs."""
     preset: str = ""
     """Name of its preset, or the path of its file; empty for a task without presets."""
     preset_settings: Preset = Preset()

@@ -33,7 +33,7 @@ MAX_SKIPPED = 5
 PLAYS_PER_FILE = 25
 """Plays in a cache file."""
 EVENTS = ("still", "lit first", "lit second", "lit third", "carried", "placed", "pushed")
-"""What can become of a thing at a pose: nothing; it is a button whose lamp changes to the colour of the first, second,
+"""Events of a thing at a pose: nothing; it is a button whose lamp changes to the colour of the first, second,
 or third and later push; it is in the gripper and moves; it was in the gripper, which lets go of it; it moves otherwise.
 """
 MAX_THINGS = 5

@@ -35,7 +35,7 @@ class Degradation(ABC):
     kind: ClassVar[str]
     family: ClassVar[Family]
     about: ClassVar[str]
-    """What a dose does to a future, as a sentence that begins with a verb."""
+    """The effect of a dose on a future, as a sentence that begins with a verb."""
     unit: ClassVar[str]
     """Unit of the dose."""
     doses: ClassVar[Mapping[str, tuple[float, ...]]]
