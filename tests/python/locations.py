@@ -10,4 +10,4 @@ PYTHON_TESTS = Path(__file__).resolve().parent
 TESTS = PYTHON_TESTS.parent
 ROOT = TESTS.parent
 ROOM_FOLDERS = sorted({str(file.parent) for file in PYTHON_TESTS.glob("*/test_*.py")})
-"""Of all rooms, for `sys.path`: some tests use parts of others."""
+"""Folders of all rooms, for `sys.path`: some tests use parts of others."""

@@ -18,7 +18,7 @@ from folders import contents
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
-from locations import PYTHON_TESTS
+from locations import TESTS
 from PIL import Image
 
 import wiw
@@ -37,7 +37,6 @@ from wiw.training.collect_navigation import collect_navigation
 pyarrow = pytest.importorskip("pyarrow", reason="needs wiw[export]")
 parquet = pytest.importorskip("pyarrow.parquet", reason="needs wiw[export]")
 
-HERE = PYTHON_TESTS
 RULES = {"min_samples": 60, "spacing": 1.5, "leaf_ratio": 0.5, "max_scene_frames": 60}
 SIZE = (36, 64)
 RGB, DEPTH, FRONT = "observation.images.rgb", "observation.images.depth", "observation.images.front"
@@ -240,7 +239,9 @@ def test_large_pictures_are_thinned_and_long_episodes_sampled() -> None:
 
 
 def test_datasets_loads_and_streams_it(exported: Path, tmp_path: Path) -> None:
-    datasets = pytest.importorskip("datasets", minversion="2")
+    pytest.importorskip("datasets.arrow_dataset", reason="no datasets: pip install datasets")
+    import datasets
+
     frames = read_frames(exported / "navigation")
     loaded = datasets.load_dataset(str(exported / "navigation"), split="train", cache_dir=str(tmp_path))
     np.testing.assert_array_equal(np.array(loaded[7][DEPTH]), frames[DEPTH][7])
@@ -479,7 +480,7 @@ def test_lerobot_reads_it(lerobot_python: str, exported: Path, tmp_path: Path, n
     """The package itself says the same about frames, windows of actions, episodes, tasks and statistics."""
     folder, out = exported / name, tmp_path / "read.npz"
     environment = {**os.environ, "HF_HUB_OFFLINE": "1", "HF_HOME": str(tmp_path / "cache")}
-    command = [lerobot_python, str(HERE.parent / "read_lerobot.py"), str(folder), str(out)]
+    command = [lerobot_python, str(TESTS / "read_lerobot.py"), str(folder), str(out)]
     done = subprocess.run(command, env=environment, capture_output=True, text=True, timeout=300, check=False)
     assert done.returncode == 0, done.stderr[-2000:]
     read = dict(np.load(out))

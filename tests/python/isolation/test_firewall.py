@@ -24,8 +24,7 @@ from wiw.studies.run_log import load_run
 from wiw.types import Conditioning, Control, Episode, Key, Proposal
 from wiw.world_models.oracle import Oracle
 
-HERE = PYTHON_TESTS
-TASK = f"{HERE / 'fakes.py'}:line_task"
+TASK = f"{PYTHON_TESTS / 'fakes.py'}:line_task"
 PLAN = np.array([FORWARD, TURN_LEFT, FORWARD], np.int8)
 
 
@@ -36,7 +35,7 @@ def test_a_model_finds_the_live_environment_only_in_the_process_of_the_run(two_r
     shown = Conditioning(env.observation.panorama[None], simulators=[env.fork()])
     controls = [Control(PLAN, np.zeros((3, 3)), np.stack([np.eye(4)] * 3), length=3)]
     truth = Oracle().rollout(shown, controls, np.zeros(1, np.uint64))
-    model = wiw.world_model(f"{HERE / 'cheats.py'}:LiveEnvironmentFinder", isolate=isolate)
+    model = wiw.world_model(f"{PYTHON_TESTS / 'cheats.py'}:LiveEnvironmentFinder", isolate=isolate)
     found = model.rollout(Conditioning(shown.image), controls, np.zeros(1, np.uint64))
     assert np.array_equal(found, truth) == (not isolate)
     assert LiveEnvironmentFinder.accepts.needs == ()
@@ -95,7 +94,7 @@ def test_seeds_invert_to_episode_decision_and_candidate_only_without_a_salt(tmp_
 @pytest.mark.parametrize("salt", ["", None])
 def test_a_key_and_the_command_line_do_not_tell_the_episode(two_rooms, tmp_path, monkeypatch, capsys, salt) -> None:
     monkeypatch.setattr("wiw.loop.keys.draw_salt", draw_salt)  # that of conftest draws none
-    name = f"{HERE / 'cheats.py'}:EpisodeRegenerator"
+    name = f"{PYTHON_TESTS / 'cheats.py'}:EpisodeRegenerator"
     flags = ["--scenes", two_rooms, "--seed", "3", "--episodes", "2", "--policy", name]
     command = [
         "run",

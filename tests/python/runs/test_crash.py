@@ -26,7 +26,6 @@ from wiw.studies.run_log import load_run
 
 KILLS = [(20, 4, 16), pytest.param((1500, 200, 300), marks=[pytest.mark.nightly, pytest.mark.timeout(7200)])]
 """Kills of runs, of each shard, and of exports: 44 for every change, 2,200 nightly."""
-HERE = PYTHON_TESTS
 
 
 def facts(run):
@@ -271,7 +270,7 @@ def task(scenes="", seed=0, preset="", backend="", **rules):
 
 def test_sigterm_ends_a_run_within_5_seconds_whatever_it_is_doing(tmp_path):
     mark, out = tmp_path / "stuck", tmp_path / "run"
-    (tmp_path / "stuck.py").write_text(STUCK.format(here=str(HERE), mark=str(mark)))
+    (tmp_path / "stuck.py").write_text(STUCK.format(here=str(PYTHON_TESTS), mark=str(mark)))
     command = [sys.executable, "-m", "wiw.cli", "run", f"{tmp_path / 'stuck.py'}:task", "--policy", "heuristic"]
     process = subprocess.Popen(
         [*command, "--out", out, "--episodes", "3", "--live", "1"],

@@ -12,10 +12,9 @@ import sys
 from pathlib import Path
 
 import pytest
-from locations import PYTHON_TESTS
+from locations import PYTHON_TESTS, TESTS
 from readers import READERS, damage
 
-HERE = PYTHON_TESTS
 MOST_BYTES, MOST_SECONDS = 3 << 30, 10
 FEW, MANY = 40, int(os.environ.get("WIW_FUZZ_ROUNDS", "5000"))
 
@@ -48,7 +47,7 @@ def read_damaged(names: list[str], folder: Path, begin: int, count: int) -> None
 def check_readers(names: list[str], folder: Path, count: int) -> None:
     code = "import sys; from pathlib import Path; from test_readers_mutated import read_damaged; "
     code += f"read_damaged({names!r}, Path({str(folder)!r}), 0, {count})"
-    environment = {**os.environ, "PYTHONPATH": os.pathsep.join([str(HERE), str(HERE.parent), *sys.path])}
+    environment = {**os.environ, "PYTHONPATH": os.pathsep.join([str(PYTHON_TESTS), str(TESTS), *sys.path])}
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, env=environment, check=False)
     lines = done.stdout.splitlines()
     assert done.returncode == 0, f"{done.returncode} at {lines[-1:]}: {done.stderr[-3000:]}"

@@ -25,7 +25,6 @@ from wiw.runs.store_file import store_path
 from wiw.studies.evaluate import evaluate, resume_run, run_arms
 from wiw.studies.run_log import load_run
 
-HERE = PYTHON_TESTS
 TIMINGS = ("seconds",)
 
 
@@ -233,7 +232,7 @@ if __name__ == "__main__":
 def start(folder, workers, delay, out):
     script = folder / "script.py"
     script.write_text(SCRIPT)
-    paths = os.pathsep.join([str(HERE), *sys.path])
+    paths = os.pathsep.join([str(PYTHON_TESTS), *sys.path])
     return subprocess.Popen(
         [sys.executable, script, out, str(workers), str(delay)], env={**os.environ, "PYTHONPATH": paths}
     )
