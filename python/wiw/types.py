@@ -318,11 +318,14 @@ class Control:
     shared: int = 0
 
     @staticmethod
-    def of_poses(count: int, text: str = "", ids: NDArray[np.float64] | None = None) -> Control:
-        """Return a plan of `count` gripper poses without padding: in words, or as poses [count + 1, 7]."""
+    def of_poses(count: int, text: str = "", ids: NDArray[np.float64] | None = None, shared: int = 0) -> Control:
+        """Return a plan of `count` gripper poses without padding: in words, or as poses [count + 1, 7].
+
+        The frames after the first `shared` poses are not read.
+        """
         actions = np.zeros(count, np.int8)  # null tokens are 0
         still = np.broadcast_to(np.eye(4), (count, 4, 4))
-        return Control(actions, np.zeros((count, 3)), still, text, ids, length=count)
+        return Control(actions, np.zeros((count, 3)), still, text, ids, length=count, shared=shared)
 
 
 @dataclass(frozen=True)

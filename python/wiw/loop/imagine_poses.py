@@ -3,7 +3,7 @@
 API").
 
 A model of a given length imagines any plan at that length: longer plans are sampled evenly, shorter ones interpolated,
-from the gripper's present pose on. The frame at each pose of the plan is shown to the reviser.
+from the gripper's present pose on. The frame at each pose of the plan, or at its last, is shown to the reviser.
 """
 
 from __future__ import annotations
@@ -66,7 +66,7 @@ def imagine_poses(model: WorldModel, request: Request) -> ImaginedPoses:
         with clock("world_model"):
             found = ask(model, observations, [rows[i].control for i in part], seeds)
         for i, own in zip(part, found, strict=True):
-            answers[i] = own[_find_frames(rows[i])]
+            answers[i] = own[_find_frames(rows[i], request.frames.ends)]
     with clock("platform"):
         made = [[answers[place] for place in plans] for plans in places]
         rollouts = [[_make_rollout(own, request.frames.size) for own in plans] for plans in made]
@@ -84,21 +84,22 @@ def _list_rows(accepts: Accepts, request: Request) -> tuple[list[_Row], list[lis
             if name not in known:
                 known[name] = len(rows)
                 seed = seed_of(request.keys[episode], number) if accepts.seeded else 0
-                control = _make_control(accepts, plan, request.observations[episode].pose, request.wordless)
+                control = _make_control(accepts, plan, request.observations[episode].pose, request)
                 rows.append(_Row(episode, plan.actions, control, seed))
         places.append([known[plan.actions.tobytes(), plan.text] for plan in plans])
     return rows, places
 
 
-def _make_control(accepts: Accepts, plan: Proposal, here: NDArray[np.float64], wordless: bool) -> Control:
+def _make_control(accepts: Accepts, plan: Proposal, here: NDArray[np.float64], request: Request) -> Control:
     """Return the plan at the length that the model imagines, or at its own."""
-    tells = accepts.control == "text" and not wordless
+    tells = accepts.control == "text" and not request.wordless
     poses = plan.actions
     if accepts.frames:
         poses = action.resample(poses, accepts.frames - 1, start=here)
     text = plan.text or action.to_text(plan.actions) if tells else ""
     ids = np.concatenate([here[None], poses]) if accepts.control == "action" else None
-    return Control.of_poses(len(poses), text, ids)
+    unread = len(poses) - 1 if request.frames.ends and accepts.causal else 0
+    return Control.of_poses(len(poses), text, ids, unread)
 
 
 def _split_rows(rows: Sequence[_Row], most: int) -> Iterator[list[int]]:
@@ -123,9 +124,10 @@ def _build_conditioning(accepts: Accepts, inputs: Sequence[ModelInput]) -> Condi
     return Conditioning(image, depth=depth, history=history, simulators=simulators)
 
 
-def _find_frames(row: _Row) -> NDArray[np.int64]:
-    """int64 [K]: the frame of a rollout at which the gripper has come to each pose of the plan."""
-    return action.frames_of_actions(len(row.plan), row.control.length + 1, "resample")[:, 1]
+def _find_frames(row: _Row, ends: bool) -> NDArray[np.int64]:
+    """int64 [K]: the frame of a rollout at which the gripper has come to each pose of the plan; `ends`: to its last."""
+    frames = action.frames_of_actions(len(row.plan), row.control.length + 1, "resample")[:, 1]
+    return frames[-1:] if ends else frames
 
 
 def _make_rollout(frames: NDArray[np.uint8], size: tuple[int, int]) -> Rollout:
@@ -137,5 +139,5 @@ def _count_cost(rows: Sequence[_Row], episodes: int) -> list[dict[str, int]]:
     counts = [{"consultations": 1, "rows": 0, "frames": 0} for _ in range(episodes)]
     for row in rows:
         counts[row.episode]["rows"] += 1
-        counts[row.episode]["frames"] += row.control.length
+        counts[row.episode]["frames"] += row.control.length - row.control.shared
     return counts

@@ -42,7 +42,7 @@ class Scripted(Policy):
     """
 
     space = GRIPPER_POSES
-    frames = FrameSpec("front", (240, 240))
+    frames = FrameSpec("front", (240, 240), ends=True)
 
     def propose(self, situations: Sequence[Situation], candidates: int, horizon: int) -> list[list[Proposal]]:
         """Return plans that continue from the present state, each with its own errors; all equally good as far as it

@@ -373,12 +373,13 @@ class Workbench:
         """
         return self._scene_renderer.instance_names
 
-    def render_fronts_after(self, poses: ArrayLike, size: tuple[int, int]) -> NDArray[np.uint8]:
-        """Move to each of the poses [K, 7] in turn; return the front view after each, uint8 [K, H, W, 3]."""
+    def render_fronts_after(self, poses: ArrayLike, size: tuple[int, int], first: int = 0) -> NDArray[np.uint8]:
+        """Move to each of the poses [K, 7] in turn; return the front views after `poses[first:]`, uint8 [N, H, W, 3]."""
         views = []
-        for pose in np.asarray(poses, np.float64):
+        for number, pose in enumerate(np.asarray(poses, np.float64)):
             self.move_to(pose)
-            views.append(self.render_view("front", size)["color"])
+            if number >= first:
+                views.append(self.render_view("front", size)["color"])
         return np.stack(views)
 
     def get_part_poses(self) -> list[Pose]:

@@ -92,20 +92,21 @@ class ArmOracle(Oracle):
     """Send a fork of the physics to each pose of a plan, one after another, and return what it truly sees."""
 
     accepts = accepts(
-        "action", space=GRIPPER_POSES, view="perspective", needs=("simulator",), best_batch=64, seeded=False
+        "action", space=GRIPPER_POSES, view="perspective", needs=("simulator",), causal=True, best_batch=64, seeded=False
     )
 
     def rollout(
         self, observations: Conditioning, controls: Sequence[Control], seeds: NDArray[np.uint64]
     ) -> NDArray[np.uint8]:
-        """Return the true front views after each pose."""
+        """Return the true front views after each pose; frames that are not read are left unwritten."""
         assert observations.simulators is not None
         image = observations.image
         frames = np.empty((len(controls), 1 + len(controls[0].actions), *image.shape[1:]), np.uint8)
         frames[:, 0] = image
         for row, (simulator, control) in enumerate(zip(observations.simulators, controls, strict=True)):
             assert control.ids is not None
-            frames[row, 1:] = simulator.fork().render_fronts_after(control.ids[1:], image.shape[1:3])
+            views = simulator.fork().render_fronts_after(control.ids[1:], image.shape[1:3], control.shared)
+            frames[row, 1 + control.shared :] = views
         return frames
 
 

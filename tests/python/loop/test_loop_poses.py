@@ -54,9 +54,9 @@ class Fork:
     def fork(self) -> Fork:
         return Fork(self.pose, self.target)
 
-    def render_fronts_after(self, poses: Any, size: Any) -> Any:
+    def render_fronts_after(self, poses: Any, size: Any, first: int = 0) -> Any:
         assert size == (480, 480)
-        return np.stack([front_view(pose, self.target) for pose in poses])
+        return np.stack([front_view(pose, self.target) for pose in poses[first:]])
 
 
 class DotEnv(Env):
@@ -162,22 +162,22 @@ class Spy(wiw.WorldModel):
         return frames
 
 
-def imagine(model: Any, proposals: Any, observations: Any) -> Any:
+def imagine(model: Any, proposals: Any, observations: Any, ends: bool = False, simulator: Any = None) -> Any:
     """Ask a model for each episode's plans from its first observation."""
     keys, origins = [Key(0, index) for index in range(len(proposals))], [range(len(own)) for own in proposals]
     space, inputs, frames = (
         plan_space("pose7"),
-        [ModelInput(each) for each in observations],
-        FrameSpec("front", (48, 48)),
+        [ModelInput(each, simulator=simulator) for each in observations],
+        FrameSpec("front", (48, 48), ends),
     )
     return space.imagine(model, Request(space, keys, observations, inputs, proposals, origins, frames, Clock()))
 
 
-def imagine_plans(model: Any, plans: Any, episodes: int = 1) -> Any:
+def imagine_plans(model: Any, plans: Any, episodes: int = 1, ends: bool = False) -> Any:
     env = DotEnv(DotTask())
     observations = [env.begin(episode) for episode in DotTask().episodes(episodes)]
     proposals = [[Proposal(np.asarray(plan, float), text="to the left") for plan in plans] for _ in observations]
-    return imagine(model, proposals, observations)
+    return imagine(model, proposals, observations, ends, env.fork())
 
 
 def plan_of(count: int, end: float = 1.0) -> Any:
@@ -204,6 +204,33 @@ def test_a_model_of_any_length_gets_the_plan_itself() -> None:
     imagine_plans(model, [plan_of(5), plan_of(3), plan_of(5, 0.7), plan_of(5, 0.2)])
     assert [[len(c.ids) for c in controls] for _, controls, _ in model._calls] == [[4], [6, 6], [6]]
     np.testing.assert_array_equal(model._calls[1][1][0].ids[1:], plan_of(5))
+
+
+@pytest.mark.parametrize("causal", [False, True])
+def test_where_only_ends_are_read_the_last_frame_is_shown(causal: bool) -> None:
+    model = Spy(control="action", space="pose7", frames=14, causal=causal)
+    found = imagine_plans(model, [plan_of(5), plan_of(50)], ends=True)
+    ((_, controls, _),) = model._calls
+    assert [control.shared for control in controls] == [12 * causal] * 2
+    assert [rollout.frames[:, 0, 0, 0].tolist() for rollout in found.rollouts[0]] == [[13], [13]]
+    assert [rollout.real.tolist() for rollout in found.rollouts[0]] == [[False], [False]]
+    assert found.costs == [{"consultations": 1, "rows": 2, "frames": 2 if causal else 26}]
+
+
+def test_the_oracle_draws_no_view_that_is_not_read(monkeypatch: pytest.MonkeyPatch) -> None:
+    drawn: list[float] = []
+
+    def draw(pose: Any, target: Any) -> Any:
+        drawn.append(round(float(pose[0]), 6))
+        return picture(pose, target).repeat(10, axis=0).repeat(10, axis=1)
+
+    oracle, plans = wiw.world_model("oracle", space="pose7"), [plan_of(5), plan_of(3, 0.8)]
+    whole = imagine_plans(oracle, plans)
+    monkeypatch.setitem(globals(), "front_view", draw)
+    ends = imagine_plans(oracle, plans, ends=True)
+    assert drawn[1:] == [0.8, 1.0]  # after the first observation
+    for one, other in zip(ends.rollouts[0], whole.rollouts[0], strict=True):
+        np.testing.assert_array_equal(one.frames, other.frames[-1:])
 
 
 def test_equal_plans_of_an_episode_are_asked_once() -> None:

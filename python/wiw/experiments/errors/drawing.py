@@ -85,12 +85,13 @@ class DrawnBench:
         """Return a copy that moves on its own."""
         return DrawnBench(self._bench.fork(), self._offsets, self._copies)
 
-    def render_fronts_after(self, poses: ArrayLike, size: tuple[int, int]) -> NDArray[np.uint8]:
-        """Move to each of the poses [K, 7] in turn; return the front view after each, uint8 [K, H, W, 3]."""
+    def render_fronts_after(self, poses: ArrayLike, size: tuple[int, int], first: int = 0) -> NDArray[np.uint8]:
+        """Move to each of the poses [K, 7] in turn; return the front views after `poses[first:]`, uint8 [N, H, W, 3]."""
         views = []
-        for pose in np.asarray(poses, np.float64):
+        for number, pose in enumerate(np.asarray(poses, np.float64)):
             self._bench.move_to(pose)
-            views.append(self._render_front(size))
+            if number >= first:
+                views.append(self._render_front(size))
         return np.stack(views)
 
     def _render_front(self, size: tuple[int, int]) -> NDArray[np.uint8]:
