@@ -374,7 +374,7 @@ class Workbench:
         return self._scene_renderer.instance_names
 
     def render_fronts_after(self, poses: ArrayLike, size: tuple[int, int], first: int = 0) -> NDArray[np.uint8]:
-        """Move to each of the poses [K, 7] in turn; return the front views after `poses[first:]`, uint8 [N, H, W, 3]."""
+        """Move to each of the poses [K, 7] in turn; return the front views after `poses[first:]`, uint8 [N, H, W, 3]"""
         views = []
         for number, pose in enumerate(np.asarray(poses, np.float64)):
             self.move_to(pose)

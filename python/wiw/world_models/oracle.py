@@ -92,7 +92,13 @@ class ArmOracle(Oracle):
     """Send a fork of the physics to each pose of a plan, one after another, and return what it truly sees."""
 
     accepts = accepts(
-        "action", space=GRIPPER_POSES, view="perspective", needs=("simulator",), causal=True, best_batch=64, seeded=False
+        "action",
+        space=GRIPPER_POSES,
+        view="perspective",
+        needs=("simulator",),
+        causal=True,
+        best_batch=64,
+        seeded=False,
     )
 
     def rollout(

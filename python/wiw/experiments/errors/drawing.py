@@ -86,7 +86,7 @@ class DrawnBench:
         return DrawnBench(self._bench.fork(), self._offsets, self._copies)
 
     def render_fronts_after(self, poses: ArrayLike, size: tuple[int, int], first: int = 0) -> NDArray[np.uint8]:
-        """Move to each of the poses [K, 7] in turn; return the front views after `poses[first:]`, uint8 [N, H, W, 3]."""
+        """Move to each of the poses [K, 7] in turn; return the front views after `poses[first:]`, uint8 [N, H, W, 3]"""
         views = []
         for number, pose in enumerate(np.asarray(poses, np.float64)):
             self._bench.move_to(pose)
