@@ -160,24 +160,29 @@ class Observation:
         If there is a target, its box is drawn in red on the images and given as "panorama_box" and "front_box", float32
         [4], all -1 if no part is visible; the mask is left out.
         """
-        values: dict[str, Any] = {"panorama": self.panorama, "front": self.front, "odometry": self.odometry}
+        views: tuple[Literal["panorama", "front"], ...] = ("panorama", "front")
+        values: dict[str, Any] = {name: self.mark_target(name) for name in views}
+        values["odometry"] = self.odometry
         if self.depth is not None:
             values["depth"] = self.depth
-        return values if self.target is None else {**values, **_draw_boxes(self, self.target)}
+        if self.target is not None:
+            for name in views:
+                box = self._find_box(name)
+                values[f"{name}_box"] = np.full(4, -1, np.float32) if box is None else np.array(box, np.float32)
+        return values
 
+    def mark_target(self, view: Literal["panorama", "front"]) -> NDArray[np.uint8]:
+        """Return one of the images, with the target's box drawn in red if there is a target in sight."""
+        from wiw import annotate
 
-def _draw_boxes(observation: Observation, target: Target) -> dict[str, Any]:
-    """Return images with the target's box drawn, and the boxes."""
-    from wiw import annotate
+        image: NDArray[np.uint8] = getattr(self, view)
+        box = self._find_box(view)
+        return image if box is None else annotate.box(image, box, thickness=2, outside=True)
 
-    values: dict[str, Any] = {}
-    for name, image, box in (
-        ("panorama", observation.panorama, target.panorama_box),
-        ("front", observation.front, target.front_box),
-    ):
-        values[name] = image if box is None else annotate.box(image, box, thickness=2, outside=True)
-        values[f"{name}_box"] = np.full(4, -1, np.float32) if box is None else np.array(box, np.float32)
-    return values
+    def _find_box(self, view: Literal["panorama", "front"]) -> Box | None:
+        if self.target is None:
+            return None
+        return self.target.panorama_box if view == "panorama" else self.target.front_box
 
 
 @dataclass(frozen=True)

@@ -100,7 +100,7 @@ class NavigationEnv(gymnasium.Env[dict[str, Any], int], Env):
 
     def render(self) -> NDArray[np.uint8]:
         """Return the front view, as in the observation."""
-        return self.observation.as_dict()["front"]
+        return self.observation.mark_target("front")
 
     # -- the loop ------------------------------------------------------------------------------------------------------
 

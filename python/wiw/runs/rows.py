@@ -165,9 +165,10 @@ def _describe_truth(when: str, truth: Truth) -> dict[str, float]:
 
 def _encode_images(record: DecisionRecord) -> Iterator[tuple[str, bytes]]:
     decision = record.decision
-    if decision.observation is not None:
-        name = "front" if isinstance(decision.observation, ArmObservation) else "panorama"
-        yield name, encode_jpeg(decision.observation.as_dict()[name])
+    if isinstance(decision.observation, ArmObservation):
+        yield "front", encode_jpeg(decision.observation.front)
+    elif decision.observation is not None:
+        yield "panorama", encode_jpeg(decision.observation.mark_target("panorama"))
     if isinstance(record.end, ArmObservation):
         yield "end", encode_jpeg(record.end.front)
     if decision.goal is not None and decision.goal.image is not None and record.index == 0:

@@ -69,7 +69,7 @@ def _choose_picture(observation: Observation | ArmObservation) -> tuple[NDArray[
     """Return a picture of where the agent is, and what it is."""
     if isinstance(observation, ArmObservation):
         return observation.front, "seen from the front"
-    panorama = observation.as_dict()["panorama"]
+    panorama = observation.mark_target("panorama")
     return cut_part(panorama, BAND, (0, 1)), "seen, all around"
 
 

@@ -16,6 +16,7 @@ from wiw._core import planner
 from wiw.action import FORWARD, STOP, TURN_LEFT
 from wiw.errors import ArgumentError
 from wiw.loop.scheduler import run_episodes
+from wiw.runs.rows import decision_row
 from wiw.tasks.imagenav import ImageNav
 from wiw.types import Key, Observation
 
@@ -84,6 +85,22 @@ def test_an_observation_hands_out_no_simulator(env):
 def test_a_policy_that_reads_panoramas_costs_no_front_views(env):
     decision = wiw.Agent("matcher", "warp").decide(env.observation, env.goal, Key(0, 0))
     assert decision.observation is env.observation and drawn(env.observation) == {"panorama", "depth"}
+
+
+def test_pictures_are_kept_without_front_views(two_rooms):
+    task, seen, pictures = ImageNav(scenes=two_rooms, decisions=2), [], []
+
+    class Sink:
+        def decision(self, record):
+            pictures.append(dict(decision_row("none", record, with_images=True).images))
+            seen.append(drawn(record.decision.observation))
+
+        def episode(self, result):
+            assert result.status == "done", result.error
+
+    run_episodes(task, wiw.Agent("matcher"), [(0, task.episode(0))], seed=0, live=1, sink=Sink())
+    assert [set(each) for each in pictures] == [{"panorama", "goal"}, {"panorama"}]
+    assert seen == [{"panorama", "depth"}] * 2
 
 
 def test_what_was_observed_goes_before_the_next_is(two_rooms):

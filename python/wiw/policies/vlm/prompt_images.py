@@ -25,8 +25,7 @@ Image = NDArray[np.uint8]
 
 def render_observation(observation: Observation, side: int | None = None) -> tuple[Image, Image]:
     """Return front view, this many pixels a side, and panorama, with the target's box where there is a target."""
-    shown = observation.as_dict()
-    return resize_view(shown["front"], side), shown["panorama"]
+    return resize_view(observation.mark_target("front"), side), observation.mark_target("panorama")
 
 
 def resize_view(view: Image, side: int | None) -> Image:
