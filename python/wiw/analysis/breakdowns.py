@@ -201,8 +201,8 @@ def read_anytime_curve(done: Done, cuts: Cuts, seed: int) -> list[Breakdown]:
             at = cuts.make_metric(cut)
             if ended and all(at.name in o["metrics"] for o in ended.values()):
                 estimates.setdefault(arm, {})[str(cut)] = _estimate(list(ended.values()), at, seed)
-    title = f"{_make_title(cuts.metric)} if cut after so many {cuts.unit}"
-    heading = f"{cuts.metric.label} if cut after so many {cuts.unit}"
+    title = f"{_make_title(cuts.metric)} within N {cuts.unit}"
+    heading = f"{cuts.metric.label} within N {cuts.unit}"
     found = Breakdown("anytime", title, heading, cuts.about, "cut", cuts.metric, estimates, cut_unit=cuts.unit)
     return [found] if estimates else []
 
@@ -233,7 +233,7 @@ def _tabulate_anytime_differences(base: str, cells: Mapping[tuple[str, str], Dif
     for (arm, cut), difference in cells.items():
         estimates.setdefault(arm, {})[cut] = difference.estimate
     adjusted = zip(cells, adjust_p_values(list(cells.values())), strict=True)
-    heading = f"{cuts.metric.label} if cut after so many {cuts.unit}, difference from {base}"
+    heading = f"{cuts.metric.label} within N {cuts.unit}, difference from {base}"
     return Breakdown(
         "anytime_differences",
         f"{heading}, points",

@@ -403,7 +403,7 @@ def _draw_binned_rates(axes: Axes, outcomes: Outcomes, colors: Mapping[str, str]
 
 
 def anytime_curve(found: Breakdown) -> Markup:
-    """Plot the score if episodes are cut after so many primitives or decisions, with bands; blind answers dashed."""
+    """Plot the score within N primitives or decisions, with bands; blind answers dashed."""
     figure, axes = _make_figure()
     colors, cuts = arm_colors(list(found.estimates)), [int(key) for key in found.keys]
     blind = found.estimates.get(BLIND)
@@ -422,7 +422,7 @@ def anytime_curve(found: Breakdown) -> Markup:
 
 
 def anytime_differences(found: Breakdown) -> Markup:
-    """Plot the gain in score over a base if episodes are cut after so many primitives or decisions, with bands."""
+    """Plot the gain in score over a base within N primitives or decisions, with bands."""
     figure, axes = _make_figure()
     _draw_bands(axes, found, arm_colors([found.base, *found.estimates]))
     axes.axhline(0, color=INK, lw=1, alpha=0.5)

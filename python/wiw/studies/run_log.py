@@ -47,7 +47,7 @@ class RunLog(Run):
         """Return another table as plain values: one dict per estimate, with value, low, high and n.
 
         Args:
-            name: "kinds" (by kind of episode), "anytime" (scores if cut after so many primitives, or decisions),
+            name: "kinds" (by kind of episode), "anytime" (scores within N primitives or decisions),
                 "anytime_differences" (paired), or "twins"; the result is empty if the task has no such table.
         """
         return Records(line for each in self.numbers().breakdowns if each.name == name for line in each.list_cells())

@@ -44,7 +44,7 @@ def build_mesh(shape: Any, rounded: bool = False) -> Mesh:
         return _build_cylinder(shape.radius, shape.length / 2, edge)
     if isinstance(shape, ConvexHull):
         return _build_hull(np.asarray(shape.points))
-    raise ArgumentError(f"mesh_of: expected a shape of wiw.physics, got {type(shape).__name__}")
+    raise ArgumentError(f"build_mesh: expected a shape of wiw.physics, got {type(shape).__name__}")
 
 
 def paint_mesh(mesh: Mesh, colour: ArrayLike) -> Mesh:

@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import threading
 from collections.abc import Mapping, Sequence
+from copy import copy
 from dataclasses import dataclass
 from functools import cached_property
 from typing import Any, Literal
@@ -190,8 +191,7 @@ class Workbench:
         Args:
             state: of the physics; the present one if None.
         """
-        other = object.__new__(Workbench)
-        other.__dict__.update(self.__dict__)
+        other = copy(self)
         other._world = self._world.fork()
         if state is not None:
             other._world.restore(state)
@@ -203,8 +203,7 @@ class Workbench:
         Args:
             offsets: transforms [4, 4] in the table's frame, by an object's name.
         """
-        other = object.__new__(Workbench)
-        other.__dict__.update(self.__dict__)
+        other = copy(self)
         other._offsets = dict(offsets)
         return other
 
@@ -253,7 +252,9 @@ class Workbench:
         """
         wanted = np.asarray(pose, np.float64)
         if wanted.shape != (7,) or not np.isfinite(wanted).all() or not 0 <= wanted[6] <= 1:
-            raise ArgumentError(f"go: expected a finite pose [7] with a gripper from 0 to 1, got {wanted.tolist()}")
+            raise ArgumentError(
+                f"move_to: expected a finite pose [7] with a gripper from 0 to 1, got {wanted.tolist()}"
+            )
         x, y, z, *angles = wanted[:6]
         path = self._world.plan_linear(
             place(x, y, z, angles),
@@ -275,7 +276,7 @@ class Workbench:
         """Execute `move_to`, and record every physics step.
 
         Raises:
-            ArgumentError: as `go`.
+            ArgumentError: as `move_to`.
         """
         start = self.fork()
         self._world.record()
@@ -361,7 +362,7 @@ class Workbench:
             ArgumentError: there is no such camera.
         """
         if camera not in CAMERAS:
-            raise ArgumentError(f"picture: expected a camera among {', '.join(CAMERAS)}, got {camera!r}")
+            raise ArgumentError(f"camera: expected one of {', '.join(CAMERAS)}, got {camera!r}")
         found = CAMERAS[camera]
         return self.hand_pose @ found.pose if found.on_hand else found.pose
 

@@ -74,5 +74,5 @@ def test_a_task_that_names_cuts_has_no_curve_over_decisions() -> None:
 
 def test_it_is_for_pages_and_exports_not_for_the_terminal() -> None:
     found = SummaryTable.of(summarise_answers(ANSWERS))
-    assert "oracle" in as_text(found) and "if cut after" not in as_text(found)
-    assert "oracle" in summary_html(found) and "if cut after" not in summary_html(found)
+    assert "oracle" in as_text(found) and "within N" not in as_text(found)
+    assert "oracle" in summary_html(found) and "within N" not in summary_html(found)

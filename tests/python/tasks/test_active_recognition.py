@@ -286,7 +286,7 @@ def test_the_report_speaks_of_answers(file: Path, tmp_path: Path) -> None:
     assert "The boxed thing: table" in page
     assert "Answer: table, 50 %" in page
     assert "recognised in 2 decisions" in page
-    assert "success rate, %" in page and "SR if cut after so many decisions" in page
+    assert "success rate, %" in page and "SR within N decisions" in page
     shown = (log.view().read_text(), *(file.read_text() for file in log.view().parent.glob("episodes/*.html")))
     assert len(shown) == 2 and not any(
         re.search("the goal|reached", without_tags(text), re.I) for text in [page, *shown]
