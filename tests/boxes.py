@@ -8,6 +8,28 @@ from pathlib import Path
 
 Point = tuple[float, float, float]
 
+COLORS: Mapping[str, Point] = {
+    "floor": (0.6, 0.5, 0.4),
+    "wall": (0.8, 0.8, 0.75),
+    "red": (0.8, 0.2, 0.2),
+    "green": (0.2, 0.7, 0.3),
+    "blue": (0.2, 0.3, 0.8),
+}
+TWO_ROOMS: Mapping[str, tuple[str, Point, Point]] = {
+    "floor": ("floor", (-4, -0.1, -2), (4, 0, 2)),
+    "wall_w": ("wall", (-4.1, 0, -2), (-4, 2.5, 2)),
+    "wall_e": ("blue", (4, 0, -2), (4.1, 2.5, 2)),
+    "wall_n": ("wall", (-4, 0, -2.1), (4, 2.5, -2)),
+    "wall_s": ("green", (-4, 0, 2), (4, 2.5, 2.1)),
+    "partition_a": ("wall", (-0.05, 0, -2), (0.05, 2.5, 0.6)),
+    "partition_b": ("wall", (-0.05, 0, 1.6), (0.05, 2.5, 2)),
+    "table": ("red", (-3, 0, -1.5), (-2.2, 0.7, -0.9)),
+    "shelf": ("green", (3.4, 0, -1.8), (3.9, 1.8, -0.8)),
+    "chest": ("red", (1.4, 0, -1.9), (2.2, 0.6, -1.5)),
+    "picture": ("blue", (-3.99, 1.0, 0.2), (-3.97, 1.6, 1.0)),
+}
+"""Two furnished rooms with a door between them: material, least and greatest corner by name; metres, Y up."""
+
 
 def write_boxes(path: Path, boxes: Mapping[str, tuple[str, Point, Point]], colors: Mapping[str, Point]) -> None:
     """Write boxes, each with its material and two corners in metres, and their materials beside them."""

@@ -16,7 +16,7 @@ import hypothesis
 import pytest
 
 import wiw
-from boxes import write_boxes
+from boxes import COLORS, TWO_ROOMS, write_boxes
 
 ROOT = Path(__file__).parents[1]
 
@@ -28,27 +28,6 @@ os.environ.setdefault("OMP_NUM_THREADS", "1")
 hypothesis.settings.register_profile("fixed", derandomize=True, deadline=None)
 hypothesis.settings.register_profile("explore", max_examples=1000, deadline=None)
 hypothesis.settings.load_profile("fixed")
-
-COLORS = {
-    "floor": (0.6, 0.5, 0.4),
-    "wall": (0.8, 0.8, 0.75),
-    "red": (0.8, 0.2, 0.2),
-    "green": (0.2, 0.7, 0.3),
-    "blue": (0.2, 0.3, 0.8),
-}
-BOXES = {  # name: material, least corner, greatest corner; metres, Y up
-    "floor": ("floor", (-4, -0.1, -2), (4, 0, 2)),
-    "wall_w": ("wall", (-4.1, 0, -2), (-4, 2.5, 2)),
-    "wall_e": ("blue", (4, 0, -2), (4.1, 2.5, 2)),
-    "wall_n": ("wall", (-4, 0, -2.1), (4, 2.5, -2)),
-    "wall_s": ("green", (-4, 0, 2), (4, 2.5, 2.1)),
-    "partition_a": ("wall", (-0.05, 0, -2), (0.05, 2.5, 0.6)),
-    "partition_b": ("wall", (-0.05, 0, 1.6), (0.05, 2.5, 2)),
-    "table": ("red", (-3, 0, -1.5), (-2.2, 0.7, -0.9)),
-    "shelf": ("green", (3.4, 0, -1.8), (3.9, 1.8, -0.8)),
-    "chest": ("red", (1.4, 0, -1.9), (2.2, 0.6, -1.5)),
-    "picture": ("blue", (-3.99, 1.0, 0.2), (-3.97, 1.6, 1.0)),
-}
 
 
 @pytest.fixture(scope="module")
@@ -207,5 +186,5 @@ def world_model_options(
 def two_rooms(tmp_path_factory: pytest.TempPathFactory) -> str:
     """Path of an OBJ with two furnished rooms of 4 x 4 m, joined by a door: a scene spec that loads in milliseconds."""
     folder = tmp_path_factory.mktemp("scene")
-    write_boxes(folder / "two_rooms.obj", BOXES, COLORS)
+    write_boxes(folder / "two_rooms.obj", TWO_ROOMS, COLORS)
     return str(folder / "two_rooms.obj")

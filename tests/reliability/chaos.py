@@ -31,8 +31,7 @@ from test_crash import whole  # noqa: E402
 from test_shards import read_rows  # noqa: E402
 
 import wiw  # noqa: E402
-from boxes import write_boxes  # noqa: E402
-from conftest import BOXES, COLORS  # noqa: E402
+from boxes import COLORS, TWO_ROOMS, write_boxes  # noqa: E402
 
 WIW = [sys.executable, "-m", "wiw.cli"]
 STOPPED = (0, 1, 2, 75, -signal.SIGKILL)
@@ -94,7 +93,7 @@ def main() -> None:
 def run_chaos(folder: Path, episodes: int, shards: int, period: float, seed: int) -> dict[str, Any]:
     """Run quietly, run disturbed, merge, compare; return what was done."""
     folder.mkdir(parents=True)
-    write_boxes(folder / "two_rooms.obj", BOXES, COLORS)
+    write_boxes(folder / "two_rooms.obj", TWO_ROOMS, COLORS)
     scene, model = str(folder / "two_rooms.obj"), f"mock={HERE / 'mock_model.py'}:Mock"
     command = [*WIW, "run", "imagenav", "--scenes", scene, "--policy", "heuristic", "--revision", "matcher"]
     command += [

@@ -25,8 +25,7 @@ HERE = Path(__file__).parent
 sys.path[:0] = [str(HERE.parent), str(HERE.parent / "python")]
 
 import wiw  # noqa: E402
-from boxes import write_boxes  # noqa: E402
-from conftest import BOXES, COLORS  # noqa: E402
+from boxes import COLORS, TWO_ROOMS, write_boxes  # noqa: E402
 from wiw.runs.recipes import AgentRecipe, TaskRecipe  # noqa: E402
 
 BATCH = 50
@@ -68,7 +67,7 @@ def write_scenes(folder: Path, count: int) -> list[str]:
     """Write scenes of two rooms, each with another table."""
     paths = []
     for number in range(count):
-        boxes = {**BOXES, "table": ("red", (-3, 0, -1.5), (-2.2, 0.3 + 0.002 * number, -0.9))}
+        boxes = {**TWO_ROOMS, "table": ("red", (-3, 0, -1.5), (-2.2, 0.3 + 0.002 * number, -0.9))}
         paths.append(folder / f"rooms{number:03d}.obj")
         write_boxes(paths[-1], boxes, COLORS)
     return list(map(str, paths))
