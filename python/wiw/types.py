@@ -173,11 +173,13 @@ class Observation:
 
     def mark_target(self, view: Literal["panorama", "front"]) -> NDArray[np.uint8]:
         """Return one of the images, with the target's box drawn in red if there is a target in sight."""
-        from wiw import annotate
-
         image: NDArray[np.uint8] = getattr(self, view)
         box = self._find_box(view)
-        return image if box is None else annotate.box(image, box, thickness=2, outside=True)
+        if box is None:
+            return image
+        from wiw import annotate
+
+        return annotate.box(image, box, thickness=2, outside=True)
 
     def _find_box(self, view: Literal["panorama", "front"]) -> Box | None:
         if self.target is None:
