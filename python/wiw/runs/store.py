@@ -428,9 +428,9 @@ class RunStore:
     def decisions(self, arm: str | None = None, episode: int | None = None) -> list[dict[str, Any]]:
         """Return the decisions of ended episodes in order, of all or of one arm or episode."""
         rows = self._rows(
-            "SELECT d.* FROM decision d JOIN outcome USING (arm, episode) WHERE (?1 IS NULL OR arm = ?1) "
-            "AND (?2 IS NULL OR episode = ?2) ORDER BY arm, episode, decision",
-            (arm, episode),
+            "SELECT d.* FROM decision d JOIN outcome USING (arm, episode) WHERE (? IS NULL OR arm = ?) "
+            "AND (? IS NULL OR episode = ?) ORDER BY arm, episode, decision",
+            (arm, arm, episode, episode),
         )
         for row in self._convert_types("decision", rows):
             for column in DECISION_JSON:

@@ -1,6 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
 import gzip
+import inspect
 import json
+import re
 import sqlite3
 from contextlib import closing
 
@@ -12,6 +14,7 @@ from locations import TESTS
 import wiw
 from wiw import benchmark
 from wiw.errors import ArgumentError, StoreError
+from wiw.runs import store as store_module
 from wiw.runs.judges import JudgedRow, JudgeRecord
 from wiw.runs.rows import OutcomeRow, decision_row, decode_jpeg, encode_jpeg, strip, to_json
 from wiw.runs.store import SCHEMA_VERSION, RunStore
@@ -260,3 +263,8 @@ def test_jpeg_keeps_colour_order():
     image = np.zeros((16, 16, 3), np.uint8)
     image[..., 0] = 200
     assert decode_jpeg(encode_jpeg(image))[8, 8].argmax() == 0
+
+
+def test_queries_number_no_placeholders() -> None:
+    """From Python 3.14 on, sqlite3 refuses them beside a sequence of values."""
+    assert not re.findall(r"\?\d", inspect.getsource(store_module))
