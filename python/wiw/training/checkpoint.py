@@ -77,7 +77,7 @@ class Checkpoint:
         if not self.path.exists():
             return None
         try:
-            content = torch.load(self.path, weights_only=True, mmap=self.shared)
+            content = torch.load(self.path, weights_only=True, map_location="cpu", mmap=self.shared)
             identity = content["of"]
             state = TrainingState(content["epochs"], content["step"], content["state"])
         except Exception as error:  # what torch's unpickler meets in damaged bytes raises nearly anything

@@ -16,7 +16,7 @@ from wiw.datasets.worlds import World
 from wiw.errors import ArgumentError
 from wiw.panorama import PerspectivePlan, distance_to_planar
 from wiw.perception.colors import COLORS
-from wiw.perception.labelling_network import FOCAL, PIXELS, InputSize, compute_tangents, resize_view, sample_cells
+from wiw.perception.labelling_network import FOCAL, PIXELS, InputSize, resize_view, sample_cells
 from wiw.perception.scene_labels import CATEGORIES, STATES, STRUCTURE, merge_category
 from wiw.scenes import is_generated, possible_edits
 
@@ -245,9 +245,3 @@ def _sample_colors(
         table.color[found].astype(np.uint8),
         table.category[found],
     )
-
-
-def compute_view_tangents(hfov_deg: NDArray[np.float32], size: tuple[int, int]) -> NDArray[np.float32]:
-    """Return the directions of the cells of stored views, h x w of them: float32 [N, h, w, 2]."""
-    focal = SIZE[1] / (2 * np.tan(np.radians(hfov_deg.astype(np.float64)) / 2))
-    return np.stack([compute_tangents(SIZE, InputSize(*size, float(each))) for each in focal])

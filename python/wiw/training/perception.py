@@ -8,7 +8,6 @@ from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any, ClassVar
 
-import cv2
 import numpy as np
 import torch
 from numpy.typing import NDArray
@@ -17,32 +16,29 @@ from torch.nn import functional
 
 from wiw._core import core
 from wiw.errors import ArgumentError
-from wiw.networks import has_bfloat16, single_thread
+from wiw.networks import has_bfloat16, resolve_device, single_thread
 from wiw.perception.labeller_weights import load, save
-from wiw.perception.labelling_network import (
-    FINE_CELLS,
-    MULTIPLE,
-    PIXELS,
-    InputSize,
-    Network,
-    Pointwise,
-    fuse,
-    group_cells,
-    resize_view,
-    sample_cells,
-    to_network_input,
-)
+from wiw.perception.labelling_network import FINE_CELLS, PIXELS, Network, Pointwise, fuse, group_cells
 from wiw.perception.learned_labeller import LearnedLabeller
 from wiw.perception.scene_labels import CATEGORIES, STATES
 from wiw.training import color_naming
 from wiw.training.checkpoint import Checkpoint, ResumableTrainer
 from wiw.training.gather import gather_views, require_held_out
-from wiw.training.labelled_views import HELD_OUT_FIELD, LabelledViews, ViewRules, compute_view_tangents
+from wiw.training.labelled_views import HELD_OUT_FIELD, LabelledViews, ViewRules
 from wiw.training.preparation import PREPARATION, Preparation, ProgressBar, show_no_bar
 from wiw.training.trainer import apply_gradients, run_training, warmup_cosine_schedule
+from wiw.training.view_batches import (
+    ViewTensors,
+    compute_sampling_weights,
+    count_pairs,
+    degrade_views,
+    sample_batch,
+)
 
 LEAST_CELLS = 40
 """Cells that an object must fill for its state to be evaluated."""
+ROWS = 16
+"""Held-out views that are degraded at a time."""
 
 
 @dataclass(frozen=True)
@@ -71,12 +67,14 @@ class Recipe:
     imagined: float = 0.3
     """Share of views without depth, as imagined ones are; two thirds of them are warped, blurred and noisy too."""
     bfloat16: bool = True
-    """Compute products in bfloat16 on CPUs that have instructions for it, where it is faster."""
+    """Compute products in bfloat16 on GPUs, and on CPUs that have instructions for it, where it is faster."""
     seed: int = 0
 
     def __post_init__(self) -> None:
         if min(self.epochs, self.batch, *self.widths) < 1:
             raise ArgumentError(f"Recipe: epochs, batch and widths must be positive, got {self}")
+        if not (self.rate > 0 and np.isfinite(self.rate)):
+            raise ArgumentError(f"Recipe: expected a finite learning rate above 0, got {self.rate}")
 
 
 def make_weights(
@@ -89,6 +87,7 @@ def make_weights(
     preparation: Preparation = PREPARATION,
     on_step: Callable[[int, int, float], None] = lambda step, steps, loss: None,
     bar: ProgressBar = show_no_bar,
+    device: str | None = None,
 ) -> dict[str, Any]:
     """Record views, train on them, or resume, calibrate colour words, evaluate on held-out scenes, and write both.
 
@@ -104,15 +103,17 @@ def make_weights(
         preparation: how views are recorded and cached.
         on_step: called after each step with its number, the number of all steps and a running mean of the loss.
         bar: shows the progress of recording.
+        device: of torch, for training; "cuda" if there is one, else "cpu".
 
     Returns:
         The card in the file.
 
     Raises:
-        ArgumentError: scenes that are both trained and evaluated on; a state of another training.
+        ArgumentError: scenes that are both trained and evaluated on; a state of another training; no such device.
         FileError: a file cannot be written.
     """
     require_held_out(scenes, val)
+    device = resolve_device(device)
     gathering = preparation.list_arguments(bar)
     views = gather_views(scenes, recipe.seed, rules, **gathering, change=True)
     held_out_rules = replace(rules, fields=(HELD_OUT_FIELD, HELD_OUT_FIELD))
@@ -120,7 +121,8 @@ def make_weights(
     card: dict[str, Any] = {"scenes": scenes, "val": val, "views": len(views), "sampling": asdict(rules)}
     checkpoint = Checkpoint.beside(out, {**card, "recipe": asdict(recipe), "minutes": minutes})
     with single_thread():
-        network, recipe = train(views, recipe, minutes, on_step, checkpoint)
+        held = ViewTensors.of(views, device)
+        network, recipe = train(held, recipe, minutes, on_step, checkpoint, device)
         namer = color_naming.calibrate(views, recipe.seed)
     card |= {"recipe": asdict(recipe), "categories": list(CATEGORIES), "states": find_possible_states(views)}
     save(out, network, card)  # before the evaluation, which takes another minute
@@ -140,11 +142,12 @@ def name_colors_file(weights: Path) -> Path:
 
 
 def train(
-    views: LabelledViews,
+    views: ViewTensors,
     recipe: Recipe = Recipe(),
     minutes: float | None = None,
     on_step: Callable[[int, int, float], None] = lambda step, steps, loss: None,
     checkpoint: Checkpoint | None = None,
+    device: str = "cpu",
 ) -> tuple[Network, Recipe]:
     """Train a network; return it without batch normalisation, and the recipe that reproduces it without a time limit.
 
@@ -154,10 +157,11 @@ def train(
         minutes: if given, reduces the number of epochs so that training takes about this long.
         on_step: called after each step with its number, the number of all steps and a running mean of the loss.
         checkpoint: where the state of training is saved, and from where it resumes.
+        device: of torch, where the network is trained; it is returned on the CPU.
     """
     steps_per_epoch = max(1, len(views) // recipe.batch)
     trainer, recipe = run_training(
-        lambda: _Trainer(views, recipe),
+        lambda: _Trainer(views, recipe, device),
         recipe,
         steps_per_epoch,
         minutes,
@@ -165,19 +169,7 @@ def train(
         on_step,
         checkpoint,
     )
-    return fuse(trainer.network), recipe
-
-
-@dataclass(frozen=True)
-class Batch:
-    """Views as the network takes them, and the labels of their cells."""
-
-    shown: Tensor
-    """float [B, CHANNELS, h, w]."""
-    category: Tensor
-    """int64 [B, h, w]."""
-    state: Tensor
-    """int64 [B, h, w]."""
+    return fuse(trainer.network.cpu()), recipe
 
 
 class _Trainer(ResumableTrainer):
@@ -185,20 +177,22 @@ class _Trainer(ResumableTrainer):
 
     stateful_parts: ClassVar[tuple[str, ...]] = ("network", "_auxiliary", "_optimiser")
 
-    def __init__(self, views: LabelledViews, recipe: Recipe) -> None:
+    def __init__(self, views: ViewTensors, recipe: Recipe, device: str) -> None:
         torch.manual_seed(core.fold_key([recipe.seed, 0x4C21]) % 2**63)
-        self.views, self.recipe = views, recipe
+        self.views, self.recipe, self.device = views, recipe, device
         self.network = Network(len(CATEGORIES), len(STATES), recipe.widths)
         coarser = [Pointwise(width, len(CATEGORIES)) for width in reversed(recipe.widths[1:])]
-        self._auxiliary = torch.nn.ModuleList(coarser)
-        self._set_prior(coarser)
-        self.network.to(memory_format=torch.channels_last)  # type: ignore[call-overload]
+        self._auxiliary = torch.nn.ModuleList(coarser).to(device)
+        self.network.to(device, memory_format=torch.channels_last)  # type: ignore[call-overload]
+        pairs = count_pairs(views.category, views.state, len(STATES))
+        self._set_prior(coarser, pairs.sum(axis=1))
         parameters = [*self.network.parameters(), *self._auxiliary.parameters()]
         self._optimiser = torch.optim.AdamW(parameters, recipe.rate, weight_decay=recipe.decay)
-        self._sampling_weights = _compute_sampling_weights(views.category)
-        self._bfloat16 = recipe.bfloat16 and has_bfloat16()
-        self._category_weights = torch.from_numpy(_compute_category_weights(views.category, recipe.balance))
-        self._state_weights = torch.from_numpy(_compute_state_weights(views.category, views.state))
+        self._sampling_weights = compute_sampling_weights(views.category)
+        self._bfloat16 = recipe.bfloat16 and (device != "cpu" or has_bfloat16())
+        category_weights = _compute_category_weights(pairs.sum(axis=1), recipe.balance)
+        self._category_weights = torch.from_numpy(category_weights).to(device)
+        self._state_weights = torch.from_numpy(_compute_state_weights(pairs)).to(device)
 
     def _compute_category_loss(self, logits: Tensor, category: Tensor) -> Tensor:
         """Return the loss of logits [..., categories]."""
@@ -211,21 +205,23 @@ class _Trainer(ResumableTrainer):
         losses = functional.cross_entropy(logits[known].float(), state[known], reduction="none")
         return (losses * weights).sum() / weights.sum()
 
-    def _set_prior(self, coarser: Sequence[Pointwise]) -> None:
+    def _set_prior(self, coarser: Sequence[Pointwise], counts: NDArray[np.int64]) -> None:
         """Let all heads start from the categories' frequencies, as they are weighted."""
-        share = np.bincount(self.views.category.ravel(), minlength=len(CATEGORIES)) / self.views.category.size
-        prior = np.log(np.maximum(share, 1e-5) ** (1 - self.recipe.balance))
+        prior = torch.from_numpy(np.log(_compute_shares(counts) ** (1 - self.recipe.balance)))
         with torch.no_grad():
             for head in coarser:
-                head.bias[:] = torch.from_numpy(prior)
-            self.network.head.bias.view(FINE_CELLS, -1)[:, : len(CATEGORIES)] = torch.from_numpy(prior)
+                head.bias[:] = prior
+            self.network.head.bias.view(FINE_CELLS, -1)[:, : len(CATEGORIES)] = prior
 
     def train_step(self, learning_rate: float) -> float:
         """Train on one batch of views and return its loss."""
         rng = np.random.default_rng(core.fold_key([self.recipe.seed, 0x4C22, self.step_count]))
-        coarse = learning_rate > self.recipe.coarse * self.recipe.rate
-        batch = sample_batch(self.views, self.recipe, self._sampling_weights, rng, coarse)
-        with torch.autocast("cpu", torch.bfloat16, enabled=self._bfloat16):
+        recipe = self.recipe
+        coarse = learning_rate > recipe.coarse * recipe.rate
+        batch = sample_batch(
+            self.views, recipe.batch, recipe.imagined, self._sampling_weights, rng, self.device, coarse
+        )
+        with torch.autocast(self.device.partition(":")[0], torch.bfloat16, enabled=self._bfloat16):
             features = self.network.train().compute_features(batch.shown)
             category_logits, state_logits = self.network.compute_logits(features[-1])
             coarser = [head(each) for head, each in zip(self._auxiliary, features[:-1], strict=True)]
@@ -245,100 +241,20 @@ class _Trainer(ResumableTrainer):
         return float(loss.detach())
 
 
-def _compute_sampling_weights(category: NDArray[np.uint8]) -> NDArray[np.float64]:
-    """Return each view's sampling probability, proportional to the number of categories that it shows."""
-    shown = np.array([len(np.unique(view)) for view in category], np.float64)
-    return np.asarray(shown / shown.sum())
+def _compute_shares(counts: NDArray[np.int64]) -> NDArray[np.float64]:
+    """Return the share of each category among all cells, at least a small one."""
+    return np.asarray(np.maximum(counts / counts.sum(), 1e-5))
 
 
-def _compute_category_weights(category: NDArray[np.uint8], balance: float) -> NDArray[np.float32]:
-    """Return the weights of the categories' pixels; their mean over all pixels is 1."""
-    share = np.bincount(category.ravel(), minlength=len(CATEGORIES)) / category.size
-    weights = np.maximum(share, 1e-5) ** -balance
-    return np.asarray(weights / (weights * share).sum(), np.float32)
+def _compute_category_weights(counts: NDArray[np.int64], balance: float) -> NDArray[np.float32]:
+    """Return the weights of the categories' cells; their mean over all cells is 1."""
+    weights = _compute_shares(counts) ** -balance
+    return np.asarray(weights / (weights * counts / counts.sum()).sum(), np.float32)
 
 
-def _compute_state_weights(category: NDArray[np.uint8], state: NDArray[np.uint8]) -> NDArray[np.float32]:
+def _compute_state_weights(pairs: NDArray[np.int64]) -> NDArray[np.float32]:
     """Return the weights of the states of each category, float32 [categories, states]."""
-    pairs = category.astype(np.int64) * len(STATES) + state
-    counts = np.bincount(pairs.ravel(), minlength=len(CATEGORIES) * len(STATES))
-    return (np.maximum(counts, 1) ** -0.5).reshape(len(CATEGORIES), len(STATES)).astype(np.float32)
-
-
-def sample_batch(
-    views: LabelledViews, recipe: Recipe, weights: NDArray[np.float64], rng: np.random.Generator, coarse: bool = False
-) -> Batch:
-    """Sample views, half of them mirrored, with other brightness and tint, a share of them like imagined ones.
-
-    If `coarse`, twice as many views as usual, at about half their size.
-    """
-    count = 2 * recipe.batch if coarse else recipe.batch
-    rows = rng.choice(len(views), count, p=weights)
-    images, category, state = views.images[rows], views.category[rows], views.state[rows]
-    depth = views.depth[rows].astype(np.float32)
-    for i in np.flatnonzero(rng.random(count) < recipe.imagined):
-        depth[i] = 0
-        if rng.random() < 2 / 3:
-            images[i], labels = degrade_view(images[i], np.stack([category[i], state[i]], axis=-1), rng)
-            category[i], state[i] = labels[..., 0], labels[..., 1]
-    mirrored = rng.random(count) < 0.5
-    for array in (images, depth, category, state):
-        array[mirrored] = array[mirrored, :, ::-1]
-    light = rng.uniform(0.75, 1.3, (count, 1, 1, 1)) * rng.uniform(0.92, 1.08, (count, 1, 1, 3))
-    images = np.clip(images * light.astype(np.float32), 0, 255).astype(np.uint8)
-    tangents = compute_view_tangents(views.hfov_deg[rows], (category.shape[1], category.shape[2]))
-    if coarse:
-        images, depth, category, state, tangents = _halve(images, depth, category, state, tangents)
-    return Batch(
-        to_network_input(images, tangents, depth),
-        torch.from_numpy(category.astype(np.int64)),
-        torch.from_numpy(state.astype(np.int64)),
-    )
-
-
-def _halve(
-    images: NDArray[np.uint8],
-    depth: NDArray[np.float32],
-    category: NDArray[np.uint8],
-    state: NDArray[np.uint8],
-    tangents: NDArray[np.float32],
-) -> tuple[NDArray[np.uint8], NDArray[np.float32], NDArray[np.uint8], NDArray[np.uint8], NDArray[np.float32]]:
-    """Shrink views, depth, labels and directions to about half their size, a size that the network takes."""
-    height, width = (-(-side // (2 * MULTIPLE)) * MULTIPLE for side in category.shape[1:])
-    size = InputSize(height, width, 0.0)
-    shown = np.stack([resize_view(image, size) for image in images])
-    directions = np.stack([cv2.resize(each, (width, height), interpolation=cv2.INTER_AREA) for each in tangents])
-    return shown, sample_cells(depth, size), sample_cells(category, size), sample_cells(state, size), directions
-
-
-def degrade_view(
-    image: NDArray[np.uint8], labels: NDArray[np.uint8], rng: np.random.Generator
-) -> tuple[NDArray[np.uint8], NDArray[np.uint8]]:
-    """Make a view as imperfect as imagined ones: warped, with its labels, then blurred or coarse, and noisy.
-
-    Args:
-        image: uint8 [h, w, 3].
-        labels: uint8 [h / PIXELS, w / PIXELS, C].
-        rng: what chance decides.
-    """
-    height, width = image.shape[:2]
-    field = rng.normal(0, rng.uniform(0, 7), (5, 6, 2)).astype(np.float32)
-    offset = cv2.resize(field, (width, height), interpolation=cv2.INTER_CUBIC)
-    across, down = np.meshgrid(np.arange(width, dtype=np.float32), np.arange(height, dtype=np.float32))
-    across_source, down_source = across + offset[..., 0], down + offset[..., 1]
-    image = np.asarray(cv2.remap(image, across_source, down_source, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REFLECT))
-    middle = (slice(PIXELS // 2, None, PIXELS),) * 2
-    source = np.stack([across_source, down_source], axis=-1)[middle] / PIXELS
-    columns, rows = np.clip(source, 0, (width // PIXELS - 1, height // PIXELS - 1)).astype(np.intp).transpose(2, 0, 1)
-    labels = labels[rows, columns]
-    if rng.random() < 0.5:
-        image = np.asarray(cv2.GaussianBlur(image, (0, 0), rng.uniform(0.5, 3.2)))
-    else:
-        coarse = 1 / rng.uniform(1.0, 4.5)
-        small = cv2.resize(image, None, fx=coarse, fy=coarse, interpolation=cv2.INTER_AREA)
-        image = np.asarray(cv2.resize(small, (width, height), interpolation=cv2.INTER_LINEAR))
-    noise = rng.normal(0, rng.uniform(0, 10), image.shape)
-    return np.clip(image + noise, 0, 255).astype(np.uint8), labels
+    return np.asarray(np.maximum(pairs, 1) ** -0.5, np.float32)
 
 
 def find_possible_states(views: LabelledViews) -> dict[str, list[str]]:
@@ -361,27 +277,28 @@ def evaluate(network: Network, states: dict[str, list[str]], views: LabelledView
         {"views": N, "plain": measures, "no_depth": measures, "degraded": measures}; see `_measure`.
     """
     labeller = LearnedLabeller.of(network, {"categories": list(CATEGORIES), "states": states})
-    rng = np.random.default_rng(core.fold_key([seed, 0x4C23]))
-    degraded = [
-        degrade_view(image, np.stack([category, state], axis=-1), rng)
-        for image, category, state in zip(views.images, views.category, views.state, strict=True)
-    ]
-    labels, nothing = np.array([each for _, each in degraded]), np.zeros_like(views.depth)
+    nothing = np.zeros_like(views.depth)
     return {
         "views": len(views),
         "plain": _measure(labeller, views),
         "no_depth": _measure(labeller, replace(views, depth=nothing)),
-        "degraded": _measure(
-            labeller,
-            replace(
-                views,
-                images=np.array([image for image, _ in degraded]),
-                depth=nothing,
-                category=labels[..., 0],
-                state=labels[..., 1],
-            ),
-        ),
+        "degraded": _measure(labeller, _degrade(views, seed)),
     }
+
+
+def _degrade(views: LabelledViews, seed: int) -> LabelledViews:
+    """Return the views degraded and without depth."""
+    key = core.fold_key([seed, 0x4C23])
+    rng, random = np.random.default_rng(key), torch.Generator().manual_seed(key % 2**63)
+    labels = np.stack([views.category, views.state], axis=-1)
+    images, moved = np.empty_like(views.images), np.empty_like(labels)
+    for first in range(0, len(views), ROWS):
+        part = slice(first, first + ROWS)
+        shown = torch.from_numpy(views.images[part]).permute(0, 3, 1, 2).float()
+        shown, found = degrade_views(shown, torch.from_numpy(labels[part]), rng, random)
+        images[part], moved[part] = shown.permute(0, 2, 3, 1).round().byte().numpy(), found.numpy()
+    nothing = np.zeros_like(views.depth)
+    return replace(views, images=images, depth=nothing, category=moved[..., 0], state=moved[..., 1])
 
 
 def _measure(labeller: LearnedLabeller, views: LabelledViews) -> dict[str, Any]:

@@ -8,6 +8,7 @@ from functools import partial
 from pathlib import Path
 from typing import Any
 
+import cv2
 import numpy as np
 import pytest
 
@@ -20,7 +21,8 @@ from wiw.perception.scene_labels import CATEGORIES, STATES
 
 torch = pytest.importorskip("torch", reason="needs wiw[torch]")
 
-from wiw.perception.labelling_network import CHANNELS, COLOR_CHANNELS, FOCAL, PIXELS  # noqa: E402
+from wiw.perception import labelling_network  # noqa: E402
+from wiw.perception.labelling_network import CHANNELS, COLOR_CHANNELS, FOCAL, PIXELS, InputSize  # noqa: E402
 from wiw.perception.learned_labeller import LearnedLabeller  # noqa: E402
 from wiw.scenes import possible_edits  # noqa: E402
 from wiw.training import color_naming  # noqa: E402
@@ -30,6 +32,7 @@ from wiw.training.labelled_views import (  # noqa: E402
     CLOSE,
     COLOR_SAMPLES,
     FIELDS,
+    SIZE,
     LabelledViews,
     ViewRules,
     _choose_close_places,
@@ -38,14 +41,17 @@ from wiw.training.labelled_views import (  # noqa: E402
     read_instances,
     record_views,
 )
-from wiw.training.perception import (  # noqa: E402
-    Recipe,
-    _compute_sampling_weights,
-    degrade_view,
-    evaluate,
-    find_possible_states,
+from wiw.training.perception import Recipe, evaluate, find_possible_states, train  # noqa: E402
+from wiw.training.view_batches import (  # noqa: E402
+    Batch,
+    ViewTensors,
+    _blur,
+    compose_input,
+    compute_sampling_weights,
+    compute_tangents,
+    count_pairs,
+    degrade_views,
     sample_batch,
-    train,
 )
 
 pytestmark = pytest.mark.usefixtures("one_torch_thread")
@@ -86,10 +92,14 @@ def made_up(count: int, seed: int) -> LabelledViews:
     )
 
 
+def tensors(count: int, seed: int) -> ViewTensors:
+    return ViewTensors.of(made_up(count, seed), "cpu")
+
+
 @pytest.fixture(scope="module")
 def lesson() -> Any:
     views = made_up(96, 0)
-    network, recipe = train(views, Recipe(epochs=10, widths=SMALL, bfloat16=False, imagined=0.3))
+    network, recipe = train(ViewTensors.of(views, "cpu"), Recipe(epochs=10, widths=SMALL, bfloat16=False, imagined=0.3))
     assert recipe.epochs == 10
     return network, find_possible_states(views)
 
@@ -122,7 +132,7 @@ class InterruptionError(Exception):
 
 
 def test_an_interrupted_training_ends_with_the_same_weights(tmp_path: Path) -> None:
-    views, recipe = made_up(16, 0), Recipe(epochs=2, widths=SMALL, bfloat16=False)
+    views, recipe = tensors(16, 0), Recipe(epochs=2, widths=SMALL, bfloat16=False)
     whole, _ = train(views, recipe)
 
     def stop(step: int, steps: int, loss: float) -> None:
@@ -142,25 +152,62 @@ def test_an_interrupted_training_ends_with_the_same_weights(tmp_path: Path) -> N
 
 
 def test_degraded_views_keep_their_labels() -> None:
+    rng, random = np.random.default_rng(0), torch.Generator().manual_seed(0)
+    blocks = torch.from_numpy(rng.integers(0, 2, (20, 8, 12)).astype(np.uint8))
+    labels = blocks.repeat_interleave(4, dim=1).repeat_interleave(4, dim=2)[..., None].expand(-1, -1, -1, 2)
+    images = 200.0 * blocks.repeat_interleave(8, dim=1).repeat_interleave(8, dim=2)[:, None].expand(-1, 3, -1, -1)
+    shown, found = degrade_views(images, labels, rng, random)
+    assert shown.shape == images.shape and found.shape == labels.shape and found.dtype == torch.uint8
+    moved = (found != labels).float().mean(dim=(1, 2, 3))
+    agree = ((shown[:, :, 1::2, 1::2].mean(dim=1) > 100) == found[..., 0]).float().mean(dim=(1, 2))
+    assert moved.max() > 0.05 and agree.mean() > 0.9
+    assert agree.mean() > 1 - moved.mean()  # labels move with what they label
+    again = degrade_views(images, labels, np.random.default_rng(0), random.manual_seed(0))[0]
+    assert (again - shown).abs().max() > 1  # chance depends on both sources
+
+
+def test_blurs_are_those_of_opencv() -> None:
+    images = np.random.default_rng(0).uniform(0, 255, (3, 40, 60, 3)).astype(np.float32)
+    deviations = np.array([0.5, 1.4, 3.2])
+    blurred = _blur(torch.from_numpy(images).permute(0, 3, 1, 2), deviations).permute(0, 2, 3, 1).numpy()
+    for image, deviation, found in zip(images, deviations, blurred, strict=True):
+        expected = cv2.GaussianBlur(image, (21, 21), deviation, borderType=cv2.BORDER_REFLECT_101)
+        np.testing.assert_allclose(found, expected, atol=0.02)
+
+
+def test_inputs_are_those_of_the_labeller() -> None:
+    """Tensors of the training and arrays of the labeller give the network the same views."""
     rng = np.random.default_rng(0)
-    blocks = rng.integers(0, 2, (8, 12)).astype(np.uint8)
-    labels = np.kron(blocks, np.ones((4, 4), np.uint8))[..., None].repeat(2, axis=2)
-    image = np.kron(blocks, np.ones((8, 8), np.uint8))[..., None].repeat(3, axis=2) * 200
-    moved, agree = [], []
-    for _ in range(20):
-        shown, found = degrade_view(image, labels, rng)
-        assert shown.shape == image.shape and found.shape == labels.shape
-        moved.append((found != labels).mean())
-        agree.append(((shown[1::2, 1::2].mean(axis=2) > 100) == found[..., 0]).mean())
-    assert max(moved) > 0.05 and np.mean(agree) > 0.9
-    assert np.mean(agree) > 1 - np.mean(moved)  # labels move with what they label
+    images = rng.integers(0, 256, (3, PIXELS * CELLS[0], PIXELS * CELLS[1], 3)).astype(np.uint8)
+    depth = np.where(rng.random((3, *CELLS)) < 0.3, 0, rng.uniform(0.3, 9, (3, *CELLS))).astype(np.float32)
+    hfov_deg = np.float32([90.0, 98.5, 110.0])
+    focal = SIZE[1] / (2 * np.tan(np.radians(hfov_deg.astype(np.float64)) / 2))
+    directions = [labelling_network.compute_tangents(SIZE, InputSize(*CELLS, float(each))) for each in focal]
+    expected = labelling_network.to_network_input(images, np.stack(directions), depth)
+    tangents = compute_tangents(torch.from_numpy(hfov_deg), CELLS)
+    found = compose_input(torch.from_numpy(images).permute(0, 3, 1, 2).float(), tangents, torch.from_numpy(depth))
+    torch.testing.assert_close(found, expected, rtol=1e-5, atol=1e-5)
+
+
+def test_frequencies_are_counted() -> None:
+    views = made_up(5, 0)
+    pairs = count_pairs(torch.from_numpy(views.category), torch.from_numpy(views.state), len(STATES))
+    assert pairs.sum() == views.category.size and pairs[LAMP, ON] == (views.state == ON).sum()
+    assert pairs[WALL, 0] == (views.category == WALL).sum()
+    category = views.category.copy()
+    category[1] = WALL
+    shares = compute_sampling_weights(torch.from_numpy(category))
+    assert shares.sum() == pytest.approx(1) and shares[0] / shares[1] == pytest.approx(3)
+
+
+def sample(views: ViewTensors, count: int, imagined: float, coarse: bool = False) -> Batch:
+    weights = compute_sampling_weights(views.category)
+    return sample_batch(views, count, imagined, weights, np.random.default_rng(0), coarse=coarse)
 
 
 @pytest.mark.parametrize("coarse", [False, True])
 def test_batches_are_aligned(coarse: bool) -> None:
-    views = made_up(8, 0)
-    recipe = Recipe(batch=3, imagined=0.0)
-    batch = sample_batch(views, recipe, _compute_sampling_weights(views.category), np.random.default_rng(0), coarse)
+    batch = sample(tensors(8, 0), 3, 0.0, coarse)
     cells = (16, 32) if coarse else CELLS
     assert batch.shown.shape == (6 if coarse else 3, CHANNELS, *cells)
     assert batch.category.shape == (len(batch.shown), *cells) == batch.state.shape
@@ -176,10 +223,15 @@ def test_batches_are_aligned(coarse: bool) -> None:
 
 
 def test_views_like_imagined_ones_have_no_depth() -> None:
-    views, rng = made_up(8, 0), np.random.default_rng(0)
-    weights = _compute_sampling_weights(views.category)
-    batch = sample_batch(views, Recipe(batch=8, imagined=1.0), weights, rng)
+    batch = sample(tensors(8, 0), 8, 1.0)
     assert (batch.shown[:, COLOR_CHANNELS + 2 :] == 0).all()
+
+
+def test_batches_leave_the_views_as_they_are() -> None:
+    views, before = tensors(4, 0), tensors(4, 0)
+    sample(views, 8, 1.0)
+    for name in ("images", "depth", "category", "state"):
+        assert torch.equal(getattr(views, name), getattr(before, name))
 
 
 def test_apartments_are_recorded_in_other_states_too() -> None:

@@ -30,6 +30,9 @@ def train_perception(
     val: Annotated[str, arg(metavar="SPEC")] = VAL_SCENES,
     places: Count = None,
     epochs: Count = None,
+    batch: Count = None,
+    rate: Annotated[float | None, arg(metavar="RATE", help_behavior_hint="")] = None,
+    device: Annotated[str | None, arg(metavar="DEVICE", help_behavior_hint="")] = None,
     limits: Annotated[Limits, arg(name="")] = NO_LIMITS,
     preparation: Annotated[Preparation, arg(name="")] = PREPARATION,
 ) -> int:
@@ -49,22 +52,25 @@ def train_perception(
         val: Held-out scenes for evaluation; none may be trained on.
         places: Places sampled per scene. Default: 12.
         epochs: Number of epochs: how often each sample is used, on average. Default: 4.
+        batch: Views in a batch. Default: 4; 32 uses a GPU better.
+        rate: Peak learning rate. Default: 0.002.
+        device: Where to train: cpu, cuda, cuda:1, ... Default: the GPU if there is one.
         limits: Time limit and seed.
         preparation: How training data is prepared.
     """
     from wiw.perception.learned_labeller import require_torch
 
-    check_counts(places=places, epochs=epochs)
+    check_counts(places=places, epochs=epochs, batch=batch)
     require_torch()
     with write_weights("perception", out):
         from wiw.training import perception as training
         from wiw.training.labelled_views import ViewRules
 
         rules = ViewRules(**drop_none({"places": places}))
-        recipe = training.Recipe(**drop_none({"epochs": epochs, "seed": limits.seed}))
+        recipe = training.Recipe(**drop_none({"epochs": epochs, "batch": batch, "rate": rate, "seed": limits.seed}))
         with TrainingProgress() as progress:
             card = training.make_weights(
-                out, scenes, val, rules, recipe, limits.minutes, preparation, progress, track_items
+                out, scenes, val, rules, recipe, limits.minutes, preparation, progress, track_items, device
             )
         _report(card)
         print(f"colours   {training.name_colors_file(out)}")
