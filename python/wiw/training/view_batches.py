@@ -87,7 +87,8 @@ def sample_batch(
     count = 2 * count if coarse else count
     chosen = views.take(rng.choice(len(views), count, p=weights), device)
     random = torch.Generator(device).manual_seed(int(rng.integers(2**63)))
-    images, depth = chosen.images.permute(0, 3, 1, 2).float(), chosen.depth.float()
+    images = chosen.images.permute(0, 3, 1, 2).to(torch.float32, memory_format=torch.contiguous_format)
+    depth = chosen.depth.float()
     labels = torch.stack([chosen.category, chosen.state], dim=-1)
     without_depth = rng.random(count) < imagined
     depth[_find(without_depth, device)] = 0
@@ -98,7 +99,7 @@ def sample_batch(
     images[mirrored], depth[mirrored] = images[mirrored].flip(-1), depth[mirrored].flip(-1)
     labels[mirrored] = labels[mirrored].flip(2)
     light = rng.uniform(0.75, 1.3, (count, 1, 1, 1)) * rng.uniform(0.92, 1.08, (count, 3, 1, 1))
-    images = (images * torch.from_numpy(light.astype(np.float32)).to(device)).clamp(0, 255)
+    images.mul_(torch.from_numpy(light.astype(np.float32)).to(device)).clamp_(0, 255)
     if coarse:
         images, depth, labels = _halve(images, depth, labels)
     tangents = compute_tangents(chosen.hfov_deg, depth.shape[1:])

@@ -42,9 +42,10 @@ def train_perception(
     $ wiw train perception --out perception.safetensors
 
     Views of the scenes are rendered and cached first, so that an interrupted command does not render them again.
-    Training takes one to two hours on two idle cores; repeat an interrupted command to resume it. FILE also holds the
-    recipe, accuracy and IoU of categories, and accuracy of states and of colour words on the val scenes. The weights
-    shipped with wiw were trained for four epochs of a schedule first laid out for six (docs/perception.md).
+    Training takes one to two hours on two idle cores, and minutes on a GPU with --batch 32; repeat an interrupted
+    command to resume it. FILE also holds the recipe, accuracy and IoU of categories, and accuracy of states and of
+    colour words on the val scenes. The weights shipped with wiw were trained for four epochs of a schedule first laid
+    out for six (docs/perception.md).
 
     Args:
         out: File for the weights (safetensors); colour words go into a JSON file next to it.
