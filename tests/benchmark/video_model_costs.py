@@ -22,6 +22,7 @@ import time
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import asdict, dataclass
+from functools import partial
 from pathlib import Path
 from typing import Any, TypeVar
 
@@ -49,7 +50,7 @@ BUDGET = 200.0
 PLAN = (FORWARD, FORWARD, TURN_LEFT, FORWARD, FORWARD, TURN_RIGHT, FORWARD)
 SPREAD = 0.02
 """Standard deviation of weights; less where a layer sums so many inputs that values would grow."""
-COLUMNS = ("B", "size", "frames", "steps", "s/step", "rest s", "s/rollout", "timed s", "GB", "made in s")
+COLUMNS = ("params B", "size", "frames", "steps", "s/step", "rest s", "s/rollout", "timed s", "GB", "made in s")
 T = TypeVar("T")
 
 
@@ -194,18 +195,19 @@ def measure(name: str, published: Published, device: str = "cuda", short: float 
         options: of the world model; its defaults otherwise.
     """
     with tempfile.TemporaryDirectory() as folder:
-        making, model = time_call(device, lambda: make_model(name, published, Path(folder), device=device, **options))
+        make = partial(make_model, name, published, Path(folder), device=device, **options)
+        making, model = time_call(device, make)
     steps = model.steps
     networks = {place: model.pipeline.components[place] for place in published.networks}
     parameters = {place: sum(each.numel() for each in network.parameters()) for place, network in networks.items()}
     imagine(model, FEW)
     if device == "cuda":
         torch.cuda.reset_peak_memory_stats()
-    few, more = (time_call(device, lambda: imagine(model, count))[0] for count in (FEW, MORE))  # noqa: B023
+    few, more = (time_call(device, partial(imagine, model, count))[0] for count in (FEW, MORE))
     step = (more - few) / (MORE - FEW)
     rest = few - FEW * step
     predicted = rest + steps * step
-    timed = time_call(device, lambda: imagine(model, steps))[0] if predicted < short else None
+    timed = time_call(device, partial(imagine, model, steps))[0] if predicted < short else None
     return Cost(
         model=name,
         billions=sum(parameters[place] for place in published.denoisers) / 1e9,
@@ -250,7 +252,7 @@ def free_memory() -> None:
 def run(names: Sequence[str], budget: float, out: Path | None, sizes: dict[str, Published], **options: Any) -> None:
     """Measure models one after the other, printing each row and writing the records as soon as they are known."""
     start, records = time.perf_counter(), []
-    say(format_row("", COLUMNS))
+    say(format_row("model", COLUMNS))
     for index, name in enumerate(names):
         left = budget - (time.perf_counter() - start)
         if left <= 0:
