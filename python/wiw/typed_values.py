@@ -104,7 +104,10 @@ def _convert_number(value: Any) -> float:
     is_number = isinstance(value, int | float) and not isinstance(value, bool)
     if not is_number and not (isinstance(value, str) and _SCIENTIFIC.fullmatch(value)):
         raise TypeError
-    return float(value)
+    try:
+        return float(value)
+    except OverflowError:
+        raise TypeError from None
 
 
 def _convert_tuple(value: Any, kinds: Sequence[Any]) -> tuple[Any, ...]:

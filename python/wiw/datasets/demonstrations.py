@@ -107,10 +107,15 @@ class Demonstrations(Sequence[Demonstration]):
 
     @property
     def failed(self) -> dict[str, int]:
-        """Tables that experts failed at, by task; each was replaced by another one, unless they were kept."""
+        """Tables that experts failed at, by task; each was replaced by another one, unless they were kept.
+
+        Raises:
+            FileError: a file is damaged.
+        """
         counts = dict.fromkeys(self.config["tasks"], 0)
         for shard in self.files:
-            counts[shard.facts["task"]] += shard.facts["failed"]
+            with shard.blame_damage():
+                counts[shard.facts["task"]] += shard.facts["failed"]
         return counts
 
     @property
@@ -118,24 +123,26 @@ class Demonstrations(Sequence[Demonstration]):
         """Camera of the front view.
 
         Raises:
-            FileError: nothing has been collected yet.
+            FileError: nothing has been collected yet, or a file is damaged.
         """
         if not self.files:
             raise FileError(f"{self.folder}: nothing has been collected yet")
-        facts = self.files[0].facts["camera"]
-        return FrontCamera(np.array(facts["intrinsics"]), np.array(facts["T_world_camera"]))
+        with self.files[0].blame_damage():
+            facts = self.files[0].facts["camera"]
+            return FrontCamera(np.array(facts["intrinsics"]), np.array(facts["T_world_camera"]))
 
     @property
     def wrist_intrinsics(self) -> NDArray[np.float64] | None:
         """Intrinsics float64 [3, 3] of the wrist camera, as in `FrontCamera`; None if its views were not collected.
 
         Raises:
-            FileError: nothing has been collected yet.
+            FileError: nothing has been collected yet, or a file is damaged.
         """
         if not self.files:
             raise FileError(f"{self.folder}: nothing has been collected yet")
-        facts = self.files[0].facts.get("wrist_camera")
-        return None if facts is None else np.array(facts["intrinsics"])
+        with self.files[0].blame_damage():
+            facts = self.files[0].facts.get("wrist_camera")
+            return None if facts is None else np.array(facts["intrinsics"])
 
     def _resolve_tasks(self, tasks: str | Sequence[str]) -> list[str]:
         known = self.config["tasks"]

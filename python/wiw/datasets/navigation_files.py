@@ -146,11 +146,9 @@ class FrameFile(RowGroupFile):
         Raises:
             FileError: the file is damaged.
         """
-        names = [name for name in self.facts["columns"] if pictures or name not in ("rgb", "depth")]
-        try:
+        with self.blame_damage():
+            names = [name for name in self.facts["columns"] if pictures or name not in ("rgb", "depth")]
             return _build_segment(self.read(row_group, names))
-        except (LookupError, TypeError, ValueError, AttributeError) as error:
-            raise self.build_damage_error(error) from error
 
 
 def _build_segment(table: Any) -> NavigationSegment:

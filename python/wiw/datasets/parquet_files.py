@@ -4,7 +4,8 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from hashlib import sha256
 from pathlib import Path
 from typing import Any
@@ -113,7 +114,7 @@ class RowGroupFile:
         self.path, self._what = path, what
         try:
             self._metadata = parquet.read_metadata(path)
-            self.facts: dict[str, Any] = json.loads(self._metadata.metadata[KEY])
+            self.facts: dict[str, Any] = dict(json.loads(self._metadata.metadata[KEY]))
         except FileNotFoundError as error:
             raise FileError(f"{path} is missing; recreate it by repeating the `wiw collect` command") from error
         except (OSError, ArrowException, KeyError, TypeError, ValueError) as error:
@@ -136,6 +137,18 @@ class RowGroupFile:
             with parquet.ParquetFile(self.path, metadata=self._metadata, page_checksum_verification=True) as file:
                 return file.read_row_group(index, columns=columns)
         except (OSError, ArrowException, LookupError, TypeError, ValueError) as error:
+            raise self.build_damage_error(error) from error
+
+    @contextmanager
+    def blame_damage(self) -> Iterator[None]:
+        """Turn errors from unexpected content into a FileError.
+
+        Raises:
+            FileError: the file is damaged.
+        """
+        try:
+            yield
+        except (AttributeError, LookupError, TypeError, ValueError) as error:
             raise self.build_damage_error(error) from error
 
     def build_damage_error(self, error: Exception) -> FileError:

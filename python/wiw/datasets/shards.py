@@ -82,10 +82,8 @@ class Shard(RowGroupFile):
             FileError: the file is damaged.
         """
         rows = self.read(index).to_pydict()
-        try:
+        with self.blame_damage():
             return _build_demonstration(rows)
-        except (LookupError, TypeError, ValueError) as error:
-            raise self.build_damage_error(error) from error
 
     def read_outline(self, index: int) -> Outline:
         """Return when the actions of a demonstration end, and at which table; its pictures are not read.
@@ -94,10 +92,8 @@ class Shard(RowGroupFile):
             FileError: the file is damaged.
         """
         rows = self.read(index, ["task", "seed", "ended"]).to_pydict()
-        try:
+        with self.blame_damage():
             return Outline(rows["task"][0], rows["seed"][0], np.array(rows["ended"], np.bool_))
-        except (LookupError, TypeError, ValueError) as error:
-            raise self.build_damage_error(error) from error
 
 
 def _list_columns(demonstration: Demonstration) -> list[str]:

@@ -181,7 +181,7 @@ def _read_run(name: str, content: Any, shared: Mapping[str, Any], where: str) ->
     agents = _read_arms(content.get("arms"), content.get("agent") or {}, where)
     pairs = tuple((str(arm), str(base)) for arm, base in _require_pairs(content.get("compare") or [], where))
     pairs = tuple(pair for pair in pairs if all(arm in agents for arm in pair) or _refuse_pair(pair, content, where))
-    plots = tuple(content.get("plots") or ("success",))
+    plots = _require_names(content.get("plots") or ["success"], f"{where}: plots")
     require_known(plots, PLOTS, f"{where}: plots")
     quality = _require_mapping(content.get("quality") or {}, f"{where}: quality") if "quality" in plots else None
     require_known(quality or {}, _QUALITY_KEYS, f"{where}: quality")
@@ -251,6 +251,12 @@ def _require_pairs(value: Any, where: str) -> Sequence[Sequence[Any]]:
     if not isinstance(value, list) or not all(isinstance(pair, list) and len(pair) == 2 for pair in value):
         raise ArgumentError(f"{where}: compare: expected pairs of arms, such as [[front, none]], got {value!r}")
     return value
+
+
+def _require_names(value: Any, where: str) -> tuple[str, ...]:
+    if not isinstance(value, list) or not all(isinstance(name, str) for name in value):
+        raise ArgumentError(f"{where}: expected a list of names, got {value!r}")
+    return tuple(value)
 
 
 def _require_mapping(value: Any, where: str) -> Mapping[str, Any]:

@@ -60,6 +60,7 @@ def test_what_fits_is_read_in_its_declared_type(name: str, given: Any, read: Any
         ("share", "0.5x", "a number"),
         ("share", "nan", "a number"),
         ("share", False, "a number"),
+        ("share", 10**400, "a number"),
         ("flag", 1, "true or false"),
         ("title", 3, "text"),
         ("file", 3, "a path or text or null"),

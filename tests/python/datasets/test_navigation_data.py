@@ -190,6 +190,15 @@ def test_what_is_written_is_read(
         assert bare.encoded_images == (None,) * len(each) and bare.encoded_depths is None
 
 
+def test_facts_without_columns_are_damage(tmp_path: Path) -> None:
+    path, schema = tmp_path / "train-00000-00.parquet", navigation_schema(False, {})
+    write_frames(path, schema, [build_table(made_up(np.random.default_rng(0), 2, 0, False, True), schema)])
+    file = FrameFile(path)
+    del file.facts["columns"]
+    with pytest.raises(FileError, match="damaged"):
+        file.read_segment(0)
+
+
 @settings(max_examples=40)
 @given(st.integers(1, 9), st.integers(0, 2**32), st.data())
 def test_a_clip_is_a_part_of_its_segment(frames: int, seed: int, data: Any) -> None:

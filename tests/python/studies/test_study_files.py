@@ -133,6 +133,7 @@ def test_variables_are_filled_in_and_arms_are_merged(own: Path) -> None:
         ("[around, front], ", "[round, front], ", "compare: unknown name 'round'.*Did you mean around"),
         ("[[around, front], [left-out, front]]", "[around, front]", "compare: expected pairs of arms"),
         ("[success, rollouts]", "[succes]", "plots: unknown name 'succes'.*Did you mean success"),
+        ("[success, rollouts]", "true", "plots: expected a list of names, got True"),
         ("keep_images: 0", "keep_image: 0", "settings: unknown name 'keep_image'.*Did you mean keep_images"),
         ("seed: 3", "out: there", "settings: unknown name 'out'"),
         ("seed: 3", "seed: three", "settings: seed: expected a whole number or null, got 'three'"),
