@@ -59,19 +59,20 @@ class Published:
         return [place for place in self.networks if place in ("unet", "transformer", "transformer_2")]
 
 
+XXL = {
+    "d_model": 4096,
+    "d_kv": 64,
+    "d_ff": 10240,
+    "num_layers": 24,
+    "num_heads": 64,
+    "feed_forward_proj": "gated-gelu",
+}
+"""Sizes of T5 1.1 XXL and UMT5 XXL."""
+
+
 def t5_xxl() -> Any:
     """Encoder of google/t5-v1_1-xxl."""
-    return T5EncoderModel(
-        T5Config(
-            vocab_size=32128,
-            d_model=4096,
-            d_kv=64,
-            d_ff=10240,
-            num_layers=24,
-            num_heads=64,
-            feed_forward_proj="gated-gelu",
-        )
-    )
+    return T5EncoderModel(T5Config(vocab_size=32128, **XXL))
 
 
 def t5_11b() -> Any:
@@ -91,17 +92,7 @@ def t5_11b() -> Any:
 
 def umt5_xxl() -> Any:
     """Encoder of google/umt5-xxl."""
-    return UMT5EncoderModel(
-        UMT5Config(
-            vocab_size=256384,
-            d_model=4096,
-            d_kv=64,
-            d_ff=10240,
-            num_layers=24,
-            num_heads=64,
-            feed_forward_proj="gated-gelu",
-        )
-    )
+    return UMT5EncoderModel(UMT5Config(vocab_size=256384, **XXL))
 
 
 def clip_vit_h(projected: bool) -> Any:
