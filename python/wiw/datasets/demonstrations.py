@@ -129,7 +129,7 @@ class Demonstrations(Sequence[Demonstration]):
             raise FileError(f"{self.folder}: nothing has been collected yet")
         with self.files[0].blame_damage():
             facts = self.files[0].facts["camera"]
-            return FrontCamera(np.array(facts["intrinsics"]), np.array(facts["T_world_camera"]))
+            return FrontCamera(_read_matrix(facts["intrinsics"], 3), _read_matrix(facts["T_world_camera"], 4))
 
     @property
     def wrist_intrinsics(self) -> NDArray[np.float64] | None:
@@ -142,7 +142,7 @@ class Demonstrations(Sequence[Demonstration]):
             raise FileError(f"{self.folder}: nothing has been collected yet")
         with self.files[0].blame_damage():
             facts = self.files[0].facts.get("wrist_camera")
-            return None if facts is None else np.array(facts["intrinsics"])
+            return None if facts is None else _read_matrix(facts["intrinsics"], 3)
 
     def _resolve_tasks(self, tasks: str | Sequence[str]) -> list[str]:
         known = self.config["tasks"]
@@ -150,6 +150,10 @@ class Demonstrations(Sequence[Demonstration]):
         if unknown := [name for name in names if name not in known]:
             raise ArgumentError(f"{self.folder}: expected tasks among {', '.join(known)}, got {', '.join(unknown)}")
         return list(names)
+
+
+def _read_matrix(rows: Any, side: int) -> NDArray[np.float64]:
+    return np.array(rows, np.float64).reshape(side, side)
 
 
 def read_manifest(folder: Path) -> dict[str, Any]:

@@ -117,7 +117,7 @@ class RowGroupFile:
             self.facts: dict[str, Any] = dict(json.loads(self._metadata.metadata[KEY]))
         except FileNotFoundError as error:
             raise FileError(f"{path} is missing; recreate it by repeating the `wiw collect` command") from error
-        except (OSError, ArrowException, KeyError, TypeError, ValueError) as error:
+        except (OSError, ArrowException, KeyError, TypeError, ValueError, RecursionError) as error:
             raise self.build_damage_error(error) from error
         if self.facts.get("format") != form:
             raise FileError(f"{path}: expected {what} of format {form}, got {self.facts.get('format')}")
@@ -148,7 +148,7 @@ class RowGroupFile:
         """
         try:
             yield
-        except (AttributeError, LookupError, TypeError, ValueError) as error:
+        except (AttributeError, LookupError, TypeError, ValueError, OverflowError, RecursionError) as error:
             raise self.build_damage_error(error) from error
 
     def build_damage_error(self, error: Exception) -> FileError:

@@ -181,7 +181,7 @@ def _read_run(name: str, content: Any, shared: Mapping[str, Any], where: str) ->
     agents = _read_arms(content.get("arms"), content.get("agent") or {}, where)
     pairs = tuple((str(arm), str(base)) for arm, base in _require_pairs(content.get("compare") or [], where))
     pairs = tuple(pair for pair in pairs if all(arm in agents for arm in pair) or _refuse_pair(pair, content, where))
-    plots = _require_names(content.get("plots") or ["success"], f"{where}: plots")
+    plots = _require_names(content.get("plots", ["success"]), f"{where}: plots")
     require_known(plots, PLOTS, f"{where}: plots")
     quality = _require_mapping(content.get("quality") or {}, f"{where}: quality") if "quality" in plots else None
     require_known(quality or {}, _QUALITY_KEYS, f"{where}: quality")

@@ -95,7 +95,9 @@ class _Job:
     def read_failed_count(self) -> int | None:
         """Return the number of tables failed at, as the file says; None if the file is absent or damaged."""
         try:
-            return int(shards.Shard(self.path).facts["failed"])
+            file = shards.Shard(self.path)
+            with file.blame_damage():
+                return int(file.facts["failed"])
         except FileError:
             return None
 

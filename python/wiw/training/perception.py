@@ -37,8 +37,10 @@ from wiw.training.view_batches import (
 
 LEAST_CELLS = 40
 """Cells that an object must fill for its state to be evaluated."""
-ROWS = 16
+DEGRADED_AT_ONCE = 16
 """Held-out views that are degraded at a time."""
+AUGMENTATION = 2
+"""Version of how batches are made, by which checkpoints are told apart."""
 
 
 @dataclass(frozen=True)
@@ -119,7 +121,8 @@ def make_weights(
     held_out_rules = replace(rules, fields=(HELD_OUT_FIELD, HELD_OUT_FIELD))
     held_out = gather_views(val, recipe.seed, held_out_rules, **gathering, change=True)
     card: dict[str, Any] = {"scenes": scenes, "val": val, "views": len(views), "sampling": asdict(rules)}
-    checkpoint = Checkpoint.beside(out, {**card, "recipe": asdict(recipe), "minutes": minutes})
+    resumable = {**card, "recipe": asdict(recipe), "minutes": minutes, "augmentation": AUGMENTATION}
+    checkpoint = Checkpoint.beside(out, resumable)
     with single_thread():
         held = ViewTensors.of(views, device)
         network, recipe = train(held, recipe, minutes, on_step, checkpoint, device)
@@ -189,7 +192,8 @@ class _Trainer(ResumableTrainer):
         parameters = [*self.network.parameters(), *self._auxiliary.parameters()]
         self._optimiser = torch.optim.AdamW(parameters, recipe.rate, weight_decay=recipe.decay)
         self._sampling_weights = compute_sampling_weights(views.category)
-        self._bfloat16 = recipe.bfloat16 and (device != "cpu" or has_bfloat16())
+        self._device_type = torch.device(device).type
+        self._bfloat16 = recipe.bfloat16 and (self._device_type != "cpu" or has_bfloat16())
         category_weights = _compute_category_weights(pairs.sum(axis=1), recipe.balance)
         self._category_weights = torch.from_numpy(category_weights).to(device)
         self._state_weights = torch.from_numpy(_compute_state_weights(pairs)).to(device)
@@ -221,7 +225,7 @@ class _Trainer(ResumableTrainer):
         batch = sample_batch(
             self.views, recipe.batch, recipe.imagined, self._sampling_weights, rng, self.device, coarse
         )
-        with torch.autocast(self.device.partition(":")[0], torch.bfloat16, enabled=self._bfloat16):
+        with torch.autocast(self._device_type, torch.bfloat16, enabled=self._bfloat16):
             features = self.network.train().compute_features(batch.shown)
             category_logits, state_logits = self.network.compute_logits(features[-1])
             coarser = [head(each) for head, each in zip(self._auxiliary, features[:-1], strict=True)]
@@ -292,8 +296,8 @@ def _degrade(views: LabelledViews, seed: int) -> LabelledViews:
     rng, random = np.random.default_rng(key), torch.Generator().manual_seed(key % 2**63)
     labels = np.stack([views.category, views.state], axis=-1)
     images, moved = np.empty_like(views.images), np.empty_like(labels)
-    for first in range(0, len(views), ROWS):
-        part = slice(first, first + ROWS)
+    for first in range(0, len(views), DEGRADED_AT_ONCE):
+        part = slice(first, first + DEGRADED_AT_ONCE)
         shown = torch.from_numpy(views.images[part]).permute(0, 3, 1, 2).float()
         shown, found = degrade_views(shown, torch.from_numpy(labels[part]), rng, random)
         images[part], moved[part] = shown.permute(0, 2, 3, 1).round().byte().numpy(), found.numpy()

@@ -395,6 +395,17 @@ def test_files_that_are_missing_or_damaged_are_named(collected: Path, tmp_path: 
         Demonstrations(tmp_path)
 
 
+@pytest.mark.parametrize(
+    ("name", "value"),
+    [("camera", {}), ("camera", {"intrinsics": "wide", "T_world_camera": []}), ("failed", None), ("task", "juggling")],
+)
+def test_damaged_facts_are_told(collected: Path, name: str, value: Any) -> None:
+    found = Demonstrations(collected)
+    found.files[0].facts[name] = value
+    with pytest.raises(FileError, match="damaged"):
+        getattr(found, "camera" if name == "camera" else "failed")
+
+
 def test_a_damaged_picture_is_told(collected: Path) -> None:
     broken = replace(Demonstrations(collected)[0], encoded_images=(b"no picture",))
     with pytest.raises(FileError, match="picture of a demonstration is damaged"):

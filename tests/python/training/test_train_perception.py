@@ -162,8 +162,17 @@ def test_degraded_views_keep_their_labels() -> None:
     agree = ((shown[:, :, 1::2, 1::2].mean(dim=1) > 100) == found[..., 0]).float().mean(dim=(1, 2))
     assert moved.max() > 0.05 and agree.mean() > 0.9
     assert agree.mean() > 1 - moved.mean()  # labels move with what they label
-    again = degrade_views(images, labels, np.random.default_rng(0), random.manual_seed(0))[0]
-    assert (again - shown).abs().max() > 1  # chance depends on both sources
+
+
+def test_degraded_views_are_a_function_of_both_sources_of_chance() -> None:
+    images, labels = torch.full((4, 3, 64, 96), 90.0), torch.zeros((4, 32, 48, 2), dtype=torch.uint8)
+
+    def degrade(seed: int, pixels: int) -> Any:
+        random = torch.Generator().manual_seed(pixels)
+        return degrade_views(images.clone(), labels, np.random.default_rng(seed), random)[0]
+
+    assert torch.equal(degrade(0, 0), degrade(0, 0))
+    assert not torch.equal(degrade(0, 0), degrade(0, 1)) and not torch.equal(degrade(0, 0), degrade(1, 0))
 
 
 def test_blurs_are_those_of_opencv() -> None:
@@ -227,11 +236,20 @@ def test_views_like_imagined_ones_have_no_depth() -> None:
     assert (batch.shown[:, COLOR_CHANNELS + 2 :] == 0).all()
 
 
-def test_batches_leave_the_views_as_they_are() -> None:
+def test_views_that_are_taken_are_copies() -> None:
     views, before = tensors(4, 0), tensors(4, 0)
-    sample(views, 8, 1.0)
-    for name in ("images", "depth", "category", "state"):
+    taken = views.take(np.array([2, 2, 0]), "cpu")
+    for name in ("images", "depth", "category", "state", "hfov_deg"):
+        assert torch.equal(getattr(taken, name), getattr(before, name)[[2, 2, 0]])
+        getattr(taken, name).zero_()
         assert torch.equal(getattr(views, name), getattr(before, name))
+
+
+def test_views_stay_in_main_memory_where_a_gpu_has_no_room(monkeypatch: pytest.MonkeyPatch) -> None:
+    views, asked = made_up(2, 0), []
+    size = ViewTensors.of(views, "cpu").count_bytes()
+    monkeypatch.setattr(torch.cuda, "mem_get_info", lambda device: asked.append(device) or (2 * size - 1, 0))
+    assert ViewTensors.of(views, "cuda:1").images.device.type == "cpu" and asked == ["cuda:1"]
 
 
 def test_apartments_are_recorded_in_other_states_too() -> None:
@@ -248,6 +266,9 @@ def test_apartments_are_recorded_in_other_states_too() -> None:
 def test_recipes_are_checked() -> None:
     with pytest.raises(ArgumentError, match="epochs, batch and widths must be positive"):
         Recipe(epochs=0)
+    for rate in (0.0, float("nan")):
+        with pytest.raises(ArgumentError, match="expected a finite learning rate above 0"):
+            Recipe(rate=rate)
     with pytest.raises(ArgumentError, match="with walkable floor"):
         merge_views([])
 

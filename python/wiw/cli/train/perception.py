@@ -42,10 +42,10 @@ def train_perception(
     $ wiw train perception --out perception.safetensors
 
     Views of the scenes are rendered and cached first, so that an interrupted command does not render them again.
-    Training takes one to two hours on two idle cores, and minutes on a GPU with --batch 32; repeat an interrupted
-    command to resume it. FILE also holds the recipe, accuracy and IoU of categories, and accuracy of states and of
-    colour words on the val scenes. The weights shipped with wiw were trained for four epochs of a schedule first laid
-    out for six (docs/perception.md).
+    Training takes one to two hours on two idle cores, and minutes on a GPU with larger batches and more epochs; repeat
+    an interrupted command to resume it. FILE also holds the recipe, accuracy and IoU of categories, and accuracy of
+    states and of colour words on the val scenes. The weights shipped with wiw were trained for four epochs of a
+    schedule first laid out for six (docs/perception.md).
 
     Args:
         out: File for the weights (safetensors); colour words go into a JSON file next to it.
@@ -53,7 +53,7 @@ def train_perception(
         val: Held-out scenes for evaluation; none may be trained on.
         places: Places sampled per scene. Default: 12.
         epochs: Number of epochs: how often each sample is used, on average. Default: 4.
-        batch: Views in a batch. Default: 4; 32 uses a GPU better.
+        batch: Views in a batch. On a GPU, 32 hardly takes longer but needs more epochs for as many updates. Default: 4.
         rate: Peak learning rate. Default: 0.002.
         device: Where to train: cpu, cuda, cuda:1, ... Default: the GPU if there is one.
         limits: Time limit and seed.
