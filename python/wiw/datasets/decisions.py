@@ -130,7 +130,7 @@ def _build_tables(decisions: Decisions, schema: Any) -> Iterator[Any]:
 
 def _read_decision(file: RowGroupFile, index: int) -> Decisions:
     rows = file.read(index).to_pydict()
-    try:
+    with file.blame_damage(cv2.error):
         return Decisions(
             (rows["scene"][0],),
             _decode(rows["observation"][0])[None],
@@ -139,8 +139,6 @@ def _read_decision(file: RowGroupFile, index: int) -> Decisions:
             np.stack([_decode(each) for each in rows["future"]])[None],
             np.array(rows["distance"], np.float64)[None],
         )
-    except (LookupError, TypeError, ValueError, cv2.error) as error:
-        raise file.build_damage_error(error) from error
 
 
 def _decode(value: Any) -> NDArray[np.uint8]:

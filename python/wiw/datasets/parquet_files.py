@@ -133,22 +133,27 @@ class RowGroupFile:
         """
         from pyarrow import ArrowException, parquet
 
-        try:
-            with parquet.ParquetFile(self.path, metadata=self._metadata, page_checksum_verification=True) as file:
-                return file.read_row_group(index, columns=columns)
-        except (OSError, ArrowException, LookupError, TypeError, ValueError) as error:
-            raise self.build_damage_error(error) from error
+        with (
+            self.blame_damage(OSError, ArrowException),
+            parquet.ParquetFile(self.path, metadata=self._metadata, page_checksum_verification=True) as file,
+        ):
+            return file.read_row_group(index, columns=columns)
 
     @contextmanager
-    def blame_damage(self) -> Iterator[None]:
+    def blame_damage(self, *more: type[Exception]) -> Iterator[None]:
         """Turn errors from unexpected content into a FileError.
+
+        Args:
+            more: other errors by which damage shows.
 
         Raises:
             FileError: the file is damaged.
         """
+        usual = (AttributeError, LookupError, TypeError, ValueError, OverflowError, RecursionError)
+        signs: tuple[type[Exception], ...] = (*usual, *more)
         try:
             yield
-        except (AttributeError, LookupError, TypeError, ValueError, OverflowError, RecursionError) as error:
+        except signs as error:
             raise self.build_damage_error(error) from error
 
     def build_damage_error(self, error: Exception) -> FileError:

@@ -186,11 +186,13 @@ def resize_view(view: NDArray[np.uint8], size: InputSize) -> NDArray[np.uint8]:
 
 def sample_cells(values: NDArray[Value], size: InputSize) -> NDArray[Value]:
     """Pick the value, of those of each pixel [..., H, W], in the middle of each cell: depth and labels, not blurred."""
-    rows, columns = (
-        (np.arange(new) * 2 + 1) * old // (2 * new)
-        for new, old in zip((size.height, size.width), values.shape[-2:], strict=True)
-    )
-    return values[..., rows[:, None], columns]
+    height, width = values.shape[-2:]
+    return values[..., find_middles(height, size.height)[:, None], find_middles(width, size.width)]
+
+
+def find_middles(old: int, new: int) -> NDArray[np.int64]:
+    """Return which of `old` rows or columns are in the middles of `new` ones: int64 [new]."""
+    return (np.arange(new, dtype=np.int64) * 2 + 1) * old // (2 * new)
 
 
 def to_network_input(

@@ -286,12 +286,12 @@ def evaluate(network: Network, states: dict[str, list[str]], views: LabelledView
         "views": len(views),
         "plain": _measure(labeller, views),
         "no_depth": _measure(labeller, replace(views, depth=nothing)),
-        "degraded": _measure(labeller, _degrade(views, seed)),
+        "degraded": _measure(labeller, replace(_degrade(views, seed), depth=nothing)),
     }
 
 
 def _degrade(views: LabelledViews, seed: int) -> LabelledViews:
-    """Return the views degraded and without depth."""
+    """Return the views degraded, with the depth of what they were."""
     key = core.fold_key([seed, 0x4C23])
     rng, random = np.random.default_rng(key), torch.Generator().manual_seed(key % 2**63)
     labels = np.stack([views.category, views.state], axis=-1)
@@ -301,8 +301,7 @@ def _degrade(views: LabelledViews, seed: int) -> LabelledViews:
         shown = torch.from_numpy(views.images[part]).permute(0, 3, 1, 2).float()
         shown, found = degrade_views(shown, torch.from_numpy(labels[part]), rng, random)
         images[part], moved[part] = shown.permute(0, 2, 3, 1).round().byte().numpy(), found.numpy()
-    nothing = np.zeros_like(views.depth)
-    return replace(views, images=images, depth=nothing, category=moved[..., 0], state=moved[..., 1])
+    return replace(views, images=images, category=moved[..., 0], state=moved[..., 1])
 
 
 def _measure(labeller: LearnedLabeller, views: LabelledViews) -> dict[str, Any]:

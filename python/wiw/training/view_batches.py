@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 from torch.nn import functional
 
-from wiw.perception.labelling_network import COLOR_CHANNELS, MULTIPLE, PIXELS
+from wiw.perception.labelling_network import COLOR_CHANNELS, MULTIPLE, PIXELS, find_middles
 from wiw.perception.scene_labels import CATEGORIES
 from wiw.training.labelled_views import SIZE, LabelledViews
 
@@ -144,8 +144,8 @@ def _halve(images: Tensor, depth: Tensor, labels: Tensor) -> tuple[Tensor, Tenso
     """Shrink views, depth and labels to about half their size, a size that the network takes."""
     height, width = (-(-side // (2 * MULTIPLE)) * MULTIPLE for side in depth.shape[1:])
     rows, columns = (
-        (torch.arange(new, device=depth.device) * 2 + 1) * old // (2 * new)
-        for new, old in zip((height, width), depth.shape[1:], strict=True)
+        torch.from_numpy(find_middles(old, new)).to(depth.device)
+        for old, new in zip(depth.shape[1:], (height, width), strict=True)
     )
     shown = functional.interpolate(images, (PIXELS * height, PIXELS * width), mode="bilinear", antialias=True)
     return shown, depth[:, rows[:, None], columns], labels[:, rows[:, None], columns]
