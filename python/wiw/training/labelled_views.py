@@ -116,7 +116,31 @@ def change_states(spec: str, seed: int) -> str | None:
         for (chance, which), (_, edits) in zip(draws, sorted(possible.items()), strict=True)
         if chance < 0.5
     ]
+    chosen = _keep_compatible(spec, chosen)
     return f"{spec}?{'&'.join(chosen)}" if chosen else None
+
+
+def _keep_compatible(spec: str, edits: Sequence[str]) -> list[str]:
+    """Return the edits that an apartment can have together, the first of those that exclude each other.
+
+    Each edit is possible by itself, but two doors may open into the same space.
+    """
+    if _is_possible(spec, edits):
+        return list(edits)
+    kept: list[str] = []
+    for edit in edits:
+        if _is_possible(spec, [*kept, edit]):
+            kept.append(edit)
+    return kept
+
+
+def _is_possible(spec: str, edits: Sequence[str]) -> bool:
+    """Return whether an apartment can have all of these edits."""
+    try:
+        possible_edits(f"{spec}?{'&'.join(edits)}" if edits else spec)
+    except ArgumentError:
+        return False
+    return True
 
 
 @dataclass(frozen=True)

@@ -263,6 +263,16 @@ def test_apartments_are_recorded_in_other_states_too() -> None:
     assert change_states("house.glb", 0) is None
 
 
+def test_changed_states_can_all_be_had_together() -> None:
+    """In apartment 179 the doors of two washing machines open into the same space."""
+    changed = change_states("apartments:train/179", 0)
+    assert changed is not None and possible_edits(changed)
+    edits = changed.partition("?")[2].split("&")
+    assert "state:washing_machine_1=open" in edits and "state:washing_machine_2=open" not in edits
+    with pytest.raises(ArgumentError, match="its door would hit 'washing machine 1'"):
+        possible_edits(f"{changed}&state:washing_machine_2=open")
+
+
 def test_recipes_are_checked() -> None:
     with pytest.raises(ArgumentError, match="epochs, batch and widths must be positive"):
         Recipe(epochs=0)
