@@ -32,6 +32,9 @@ class LearnedLabeller(Labeller):
         WeightsError: no such file, damaged, or of another version.
     """
 
+    least_confidence = 0.7
+    """Along outlines labels are less sure than this, and depth may be that of what is behind."""
+
     def __init__(self, weights: str | Path | None = None) -> None:
         require_torch()
         from wiw.perception.labeller_weights import load

@@ -57,6 +57,8 @@ class Labeller(ABC):
     """"ids" where views must come with the simulator's instance ids."""
     privileged = False
     """Whether it uses information that no sensor of the agent measures."""
+    least_confidence = 0.3
+    """Confidence from which on a label is good enough for a map of objects."""
 
     @abstractmethod
     def compute_labels(

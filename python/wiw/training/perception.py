@@ -50,7 +50,7 @@ class Recipe:
     epochs: int = 4
     """Number of times each view is used, on average."""
     batch: int = 4
-    widths: tuple[int, int, int, int] = (32, 64, 128, 192)
+    widths: tuple[int, int, int, int] = (48, 96, 160, 224)
     """Channels of the U-Net's levels."""
     rate: float = 2e-3
     decay: float = 0.01
@@ -60,7 +60,7 @@ class Recipe:
     """Weight of the states' loss beside that of the categories. Each state of each category counts by its frequency to
     minus a half, so that a lamp that is off weighs as much as many doors that are closed.
     """
-    coarse: float = 0.5
+    coarse: float = 0.75
     """While the learning rate is above this share of its peak, views are shown at half size, twice as many in a batch:
     several times as many views in the same time. The rest of the training is at full size.
     """

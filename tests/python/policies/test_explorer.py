@@ -43,7 +43,7 @@ from wiw.runs.recipes import AgentRecipe, TaskRecipe
 from wiw.scenes import apartment_table
 from wiw.tasks.aeqa import AEQA
 from wiw.training.home_knowledge import count_homes, write_knowledge
-from wiw.types import Key, Proposal, Rollout, TextAnswer
+from wiw.types import Goal, Key, Proposal, Rollout, TextAnswer
 
 PALETTE = {
     "white": (230, 228, 222), "grey": (128, 128, 128), "black": (30, 30, 30), "brown": (110, 75, 45),
@@ -165,6 +165,37 @@ def test_an_empty_map_leaves_the_guess_from_the_text():
     for text in ("What color is the sofa?", "What is love?"):
         belief = answer(parse(text), text, home, grid)
         assert (belief.text, belief.confidence) == (blind_answer(text), 0.0)
+
+
+class Supported(ObjectMap):
+    """Objects of which views saw something else in most looks, and in every voxel in half of them."""
+
+    def measure_support(self, thing: MapObject) -> float:
+        return 0.2
+
+    def find_supported(self, thing: MapObject, least: float) -> np.ndarray:
+        return thing.voxels if least <= 0.5 else thing.voxels[:0]
+
+
+def test_thin_things_are_believed_in_with_less_support():
+    """The voxels of a picture are also those of its wall."""
+    objects, votes = Supported(CATEGORIES, STATES), np.zeros(len(CATEGORIES))
+    for number, category in enumerate(("sofa", "picture", "cup"), start=1):
+        own = votes.copy()
+        own[CATEGORIES.index(category)] = 1.0
+        voxels = pack_voxels(np.array([[float(number), 0.0, 0.5]]))
+        objects._objects[number] = MapObject(number, voxels, own, votes, (), category, "", "", 0.1, 1.0, 1, 0, 0)
+    home = believe_home(objects, OccupancyGrid(), [], load_knowledge())
+    assert [thing.category for thing in home.table.things] == ["picture", "cup"]
+
+
+def test_a_labeller_says_which_of_its_labels_are_mapped():
+    class Unsure(RedIsASofa):
+        least_confidence = 0.9
+
+    goal = Goal("aeqa", text="What color is the sofa?", question=True)
+    assert Explorer(perception=Unsure()).begin(goal, Key(0, 0)).objects.least_confidence == 0.9
+    assert Explorer(perception=RedIsASofa()).begin(goal, Key(0, 0)).objects.least_confidence == 0.3
 
 
 # -- what questions take for granted -----------------------------------------------------------------------------------

@@ -42,10 +42,13 @@ def train_perception(
     $ wiw train perception --out perception.safetensors
 
     Views of the scenes are rendered and cached first, so that an interrupted command does not render them again.
-    Training takes one to two hours on two idle cores, and minutes on a GPU with larger batches and more epochs; repeat
-    an interrupted command to resume it. FILE also holds the recipe, accuracy and IoU of categories, and accuracy of
-    states and of colour words on the val scenes. The weights shipped with wiw were trained for four epochs of a
-    schedule first laid out for six (docs/perception.md).
+    Training takes two to three hours on a CPU. On a GPU, larger batches and more epochs give much better weights in
+    minutes; those shipped with wiw were trained this way (docs/perception.md):
+
+    $ wiw train perception --scenes apartments:train:280 --places 18 --epochs 16 --batch 32
+
+    Repeat an interrupted command to resume it. FILE also holds the recipe, accuracy and IoU of categories, and accuracy
+    of states and of colour words on the val scenes.
 
     Args:
         out: File for the weights (safetensors); colour words go into a JSON file next to it.

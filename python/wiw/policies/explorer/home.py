@@ -27,10 +27,12 @@ LEAST_SIZE = 0.0008
 """Share of a view that a thing must once have filled to be believed in."""
 LEAST_SHARE = 0.4
 """Share of its votes that a thing's category must have."""
-LEAST_SUPPORT = 0.1
+LEAST_SUPPORT, LEAST_THIN_SUPPORT = 0.3, 0.1
 """Share of the votes of all views for what is there, background included, that a thing's category must have."""
-LEAST_VOXEL_SHARE = 0.35
+LEAST_VOXEL_SHARE, LEAST_THIN_VOXEL_SHARE = 0.7, 0.35
 """The same of a single voxel for being part of the thing."""
+THIN = SMALL | {"picture", "mirror", "clock", "rug"}
+"""Categories whose voxels are partly those of what they stand on or hang on; less will do for them."""
 LEAST_KEPT = 0.1
 """Share of a thing's voxels that must be left."""
 
@@ -123,7 +125,7 @@ def believe_home(objects: ObjectMap, grid: OccupancyGrid, surfaces: Sequence[Sur
         for thing in objects.objects
         if thing.size >= LEAST_SIZE
         and thing.category_share >= LEAST_SHARE
-        and objects.measure_support(thing) >= LEAST_SUPPORT
+        and objects.measure_support(thing) >= (LEAST_THIN_SUPPORT if thing.category in THIN else LEAST_SUPPORT)
     ]
     seen = _take_apart(_put_together(_drop_strays(known, objects), objects, knowledge), knowledge)
     places = {thing.id: grid.find_room(thing.points) for thing in seen}
@@ -142,7 +144,8 @@ def _drop_strays(things: Sequence[MapObject], objects: ObjectMap) -> list[MapObj
     """Return the things without the voxels that views mostly saw as something else, where enough of them is left."""
     found = []
     for thing in things:
-        voxels = objects.find_supported(thing, LEAST_VOXEL_SHARE)
+        least = LEAST_THIN_VOXEL_SHARE if thing.category in THIN else LEAST_VOXEL_SHARE
+        voxels = objects.find_supported(thing, least)
         if len(voxels) >= max(1, LEAST_KEPT * len(thing.voxels)):
             found.append(replace(thing, voxels=voxels))
     return found

@@ -72,7 +72,7 @@ class Explorer(Policy):
     def __init__(
         self,
         perception: Any = "learned",
-        sure: float = 0.45,
+        sure: float = 0.7,
         imagination: float = 8.0,
         path: float = 2.0,
         affinity: float = 6.0,
@@ -117,7 +117,8 @@ class Explorer(Policy):
 
     def begin(self, goal: Goal, key: Key) -> Memory:
         """Return an empty map."""
-        return Memory(parse(goal.text or ""), ObjectMap(self.labeller.categories, STATES))
+        objects = ObjectMap(self.labeller.categories, STATES, least_confidence=self.labeller.least_confidence)
+        return Memory(parse(goal.text or ""), objects)
 
     # -- real views ----------------------------------------------------------------------------------------------------
 
