@@ -116,28 +116,31 @@ def change_states(spec: str, seed: int) -> str | None:
         for (chance, which), (_, edits) in zip(draws, sorted(possible.items()), strict=True)
         if chance < 0.5
     ]
-    chosen = _keep_compatible(spec, chosen)
-    return f"{spec}?{'&'.join(chosen)}" if chosen else None
+    return _add_edits(spec, _keep_compatible(spec, chosen)) if chosen else None
 
 
-def _keep_compatible(spec: str, edits: Sequence[str]) -> list[str]:
+def _keep_compatible(spec: str, edits: Sequence[str]) -> Sequence[str]:
     """Return the edits that an apartment can have together, the first of those that exclude each other.
 
     Each edit is possible by itself, but two doors may open into the same space.
     """
-    if _is_possible(spec, edits):
-        return list(edits)
+    if _is_possible(_add_edits(spec, edits)):  # nearly always, and checking takes as long as for one
+        return edits
     kept: list[str] = []
     for edit in edits:
-        if _is_possible(spec, [*kept, edit]):
+        if _is_possible(_add_edits(spec, [*kept, edit])):
             kept.append(edit)
     return kept
 
 
-def _is_possible(spec: str, edits: Sequence[str]) -> bool:
-    """Return whether an apartment can have all of these edits."""
+def _add_edits(spec: str, edits: Sequence[str]) -> str:
+    return f"{spec}?{'&'.join(edits)}"
+
+
+def _is_possible(spec: str) -> bool:
+    """Return whether an apartment can have all edits of its spec together."""
     try:
-        possible_edits(f"{spec}?{'&'.join(edits)}" if edits else spec)
+        possible_edits(spec)
     except ArgumentError:
         return False
     return True

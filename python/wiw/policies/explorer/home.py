@@ -12,7 +12,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from wiw.datasets.questions.facts import FRONTED, SMALL, Room, SceneTable, Thing
+from wiw.datasets.questions.facts import FRONTED, HUNG, SMALL, Room, SceneTable, Thing
 from wiw.mapping.fragments import split_voxels
 from wiw.mapping.object_map import MapObject, ObjectMap
 from wiw.mapping.occupancy import OccupancyGrid
@@ -31,7 +31,7 @@ LEAST_SUPPORT, LEAST_THIN_SUPPORT = 0.3, 0.1
 """Share of the votes of all views for what is there, background included, that a thing's category must have."""
 LEAST_VOXEL_SHARE, LEAST_THIN_VOXEL_SHARE = 0.7, 0.35
 """The same of a single voxel for being part of the thing."""
-THIN = SMALL | {"picture", "mirror", "clock", "rug"}
+THIN = SMALL | HUNG - {"wall shelf"} | {"rug"}
 """Categories whose voxels are partly those of what they stand on or hang on; less will do for them."""
 LEAST_KEPT = 0.1
 """Share of a thing's voxels that must be left."""
