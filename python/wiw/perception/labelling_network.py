@@ -36,6 +36,8 @@ FINE_CELLS = FINE**2
 COLOR_CHANNELS = 3 * PIXELS**2
 CHANNELS = COLOR_CHANNELS + 5
 """Channels of the input; see `to_network_input`."""
+_LEVELS = (np.arange(256) * (1 / 127.5)).astype(np.float32) - 1
+"""Values of the input by byte: from -1 to 1."""
 
 
 class Network(nn.Module):
@@ -211,9 +213,8 @@ def to_network_input(
     count, height, width = len(views), views.shape[1] // PIXELS, views.shape[2] // PIXELS
     made = np.zeros((count, height, width, CHANNELS), np.float32)
     colors, rest = made[..., :COLOR_CHANNELS], made[..., COLOR_CHANNELS:]
-    cells = views.reshape(count, height, PIXELS, width, PIXELS, 3).transpose(0, 1, 3, 2, 4, 5)
-    np.multiply(cells.reshape(colors.shape), 1 / 127.5, out=colors)
-    colors -= 1
+    cells = _LEVELS.take(views).reshape(count, height, PIXELS, width, 3 * PIXELS)
+    colors.reshape(count, height, width, PIXELS, 3 * PIXELS)[:] = cells.transpose(0, 1, 3, 2, 4)
     rest[..., :2] = tangents
     if depth is not None:
         known = depth > 0

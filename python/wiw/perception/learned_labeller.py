@@ -16,9 +16,13 @@ from wiw.networks import single_thread
 from wiw.perception.scene_labels import STATES, Labeller, SceneLabels
 
 if TYPE_CHECKING:
+    from torch import Tensor
+
     from wiw.perception.labelling_network import InputSize, Network
 
 WEIGHTS = Path(__file__).parent / "labeller.safetensors"
+ROWS_AT_ONCE = 8
+"""Rows of groups of cells whose probabilities are computed at once: 1 MB, so that memory is reused and cached."""
 
 
 class LearnedLabeller(Labeller):
@@ -90,16 +94,13 @@ class LearnedLabeller(Labeller):
             np.empty((len(images), *size), np.float32),
             np.empty((len(images), *size), np.uint8),
         )
-        input_size, tangents = _plan_input(size, hfov_deg)
-        rows, columns = (
-            _map_pixels(pixels, side) for pixels, side in zip(size, (input_size.height, input_size.width), strict=True)
-        )
+        input_size, tangents, cells = _plan_input(size, hfov_deg)
         for view, image in enumerate(images):
             distances = None if depth is None else depth[view]
             category, confidence, state = self._label_view(image, distances, input_size, tangents)
-            labels.category[view] = category[rows[:, None], columns]
-            labels.confidence[view] = confidence[rows[:, None], columns]
-            labels.state[view] = state[rows[:, None], columns]
+            labels.category[view] = category.take(cells)
+            labels.confidence[view] = confidence.take(cells)
+            labels.state[view] = state.take(cells)
         return labels
 
     def _label_view(
@@ -109,7 +110,10 @@ class LearnedLabeller(Labeller):
         input_size: InputSize,
         tangents: NDArray[np.float32],
     ) -> tuple[NDArray[np.uint8], NDArray[np.float32], NDArray[np.uint8]]:
-        """Return category, confidence and state of the cells of one view."""
+        """Return category, confidence and state of the cells of one view in groups, [H/2, W/2, FINE_CELLS].
+
+        What is chosen is small; to put the logits of all cells in the order of the view would take longer.
+        """
         import torch
 
         from wiw.perception.labelling_network import resize_view, sample_cells, to_network_input
@@ -117,12 +121,11 @@ class LearnedLabeller(Labeller):
         shown = resize_view(np.ascontiguousarray(image), input_size)
         distances = None if depth is None else sample_cells(depth, input_size)[None]
         with torch.inference_mode(), single_thread():
-            category_logits, state_logits = self._network(to_network_input(shown[None], tangents[None], distances))
-            confidence, category = category_logits[0].permute(1, 2, 0).softmax(dim=2).max(dim=2)
-            places = category.numpy()
-            states = state_logits[0].permute(1, 2, 0).numpy()
-        state = np.where(self._impossible[places], -np.inf, states).argmax(axis=2)
-        return places.astype(np.uint8), confidence.numpy(), state.astype(np.uint8)
+            features = self._network.compute_features(to_network_input(shown[None], tangents[None], distances))
+            category_logits, state_logits = self._network.compute_logits(features[-1])
+            found = [choose_categories(rows) for rows in category_logits[0].split(ROWS_AT_ONCE)]
+        category, confidence = (np.concatenate(parts) for parts in zip(*found, strict=True))
+        return category, confidence, choose_states(category, state_logits[0].numpy(), self._impossible)
 
 
 def find_impossible_states(categories: Sequence[str], states: Mapping[str, Sequence[str]]) -> NDArray[np.bool_]:
@@ -134,12 +137,44 @@ def find_impossible_states(categories: Sequence[str], states: Mapping[str, Seque
     return impossible
 
 
+def choose_categories(logits: Tensor) -> tuple[NDArray[np.uint8], NDArray[np.float32]]:
+    """Return the likeliest category of each cell and its probability, [...], from logits [..., categories]."""
+    probabilities = logits.softmax(dim=-1).numpy()
+    category = probabilities.argmax(axis=-1)
+    confidence = np.take_along_axis(probabilities, category[..., None], axis=-1)[..., 0]
+    return category.astype(np.uint8), confidence
+
+
+def choose_states(
+    category: NDArray[np.uint8], logits: NDArray[np.float32], impossible: NDArray[np.bool_]
+) -> NDArray[np.uint8]:
+    """Return the likeliest of the states that each cell's category can have: uint8 [...], as `category`.
+
+    Most categories have a single one, and their logits need not be looked at.
+
+    Args:
+        category: [...].
+        logits: float32 [..., states].
+        impossible: of `find_impossible_states`.
+    """
+    state = impossible.argmin(axis=1).astype(np.uint8)[category]
+    several = ((~impossible).sum(axis=1) > 1)[category]
+    state[several] = np.where(impossible[category[several]], -np.inf, logits[several]).argmax(axis=-1)
+    return state
+
+
 @lru_cache(maxsize=16)
-def _plan_input(size: tuple[int, int], hfov_deg: float) -> tuple[InputSize, NDArray[np.float32]]:
-    from wiw.perception.labelling_network import InputSize, compute_tangents
+def _plan_input(size: tuple[int, int], hfov_deg: float) -> tuple[InputSize, NDArray[np.float32], NDArray[np.intp]]:
+    """Return the input's size and tangents, and which of all cells in groups each pixel is in, [H, W]."""
+    import torch
+
+    from wiw.perception.labelling_network import InputSize, compute_tangents, group_cells, ungroup_cells
 
     found = InputSize.of(size, hfov_deg)
-    return found, compute_tangents(size, found)
+    cells = torch.arange(found.height * found.width).reshape(1, found.height, found.width)
+    places = ungroup_cells(cells.reshape(group_cells(cells).shape))[0].numpy()
+    rows, columns = _map_pixels(size[0], found.height), _map_pixels(size[1], found.width)
+    return found, compute_tangents(size, found), places[rows[:, None], columns].astype(np.intp)
 
 
 def _map_pixels(pixels: int, cells: int) -> NDArray[np.intp]:

@@ -14,7 +14,18 @@ from wiw import scenes
 from wiw.datasets.questions import grammar
 from wiw.datasets.worlds import world
 from wiw.errors import ArgumentError, WeightsError
-from wiw.perception.colors import COLORS, FEATURES, PARAMETERS, ColorNamer, compute_features, name_color, to_oklab
+from wiw.perception.colors import (
+    COLORS,
+    FEATURES,
+    GREY_CHROMA,
+    HUES,
+    PARAMETERS,
+    QUANTILES,
+    ColorNamer,
+    compute_features,
+    name_color,
+    to_oklab,
+)
 
 
 def lit(color: tuple[int, int, int], rng: np.random.Generator) -> Any:
@@ -73,6 +84,28 @@ def test_features_do_not_depend_on_other_sets() -> None:
     found = compute_features(pixels)
     assert found.shape == (5, FEATURES) and np.isfinite(found).all()
     np.testing.assert_array_equal(found[3], compute_features(pixels[3:4])[0])
+
+
+def describe_plainly(pixels: np.ndarray) -> np.ndarray:
+    """Compute the features of one set of pixels [n, 3] as they are defined."""
+    lab = to_oklab(pixels[None])[0]
+    chroma = np.hypot(lab[:, 1], lab[:, 2])
+    weight = chroma / (chroma + GREY_CHROMA)
+    shares = np.zeros((HUES, len(pixels)))
+    for pixel, angle in enumerate(np.arctan2(lab[:, 2], lab[:, 1])):
+        sector = angle / (2 * np.pi) % 1.0 * HUES
+        shares[int(sector) % HUES, pixel] = weight[pixel] * (1 - sector % 1.0)
+        shares[(int(sector) + 1) % HUES, pixel] = weight[pixel] * (sector % 1.0)
+    quantiles = np.quantile(lab, QUANTILES, axis=0).ravel()
+    return np.concatenate([quantiles, shares.mean(axis=1), [chroma.mean(), chroma.std(), chroma.max()]])
+
+
+@pytest.mark.parametrize("count", [1, 2, 3, 11, 21, 63, 144, 145, 256])
+def test_features_are_those_defined(count: int) -> None:
+    pixels = np.random.default_rng(count).integers(0, 256, (2, count, 3), np.uint8)
+    pixels[1] = pixels[1, :1] // 64 * 64  # all of one colour, often grey
+    expected = np.stack([describe_plainly(each) for each in pixels])
+    np.testing.assert_array_equal(compute_features(pixels), expected)
 
 
 def test_parameters_are_stored_and_checked(tmp_path: Path) -> None:

@@ -13,6 +13,7 @@ import pytest
 from wiw.datasets.cameras import camera_pose
 from wiw.datasets.worlds import World, world
 from wiw.errors import ArgumentError, ContractError, WeightsError
+from wiw.networks import single_thread
 from wiw.perception.detection import Detections, Detector
 from wiw.perception.detector_labeller import DetectorLabeller
 from wiw.perception.oracle_labeller import OracleLabeller
@@ -179,6 +180,8 @@ from wiw.perception.labelling_network import (  # noqa: E402
     Network,
     compute_tangents,
     fuse,
+    resize_view,
+    sample_cells,
     to_network_input,
 )
 from wiw.perception.learned_labeller import LearnedLabeller, find_impossible_states  # noqa: E402
@@ -222,6 +225,46 @@ def test_views_of_any_size(small: LearnedLabeller, size: tuple[int, int], field:
     found = small.label(image, field)
     assert found.category.shape == (1, *size) and found.category.max() < 4
     assert ((found.confidence > 0) & (found.confidence <= 1)).all()
+
+
+def label_plainly(labeller: LearnedLabeller, image: np.ndarray, depth: np.ndarray, field: float) -> SceneLabels:
+    """Label a view [H, W, 3] from the logits that the network gives cells in the order of the view."""
+    size = InputSize.of(image.shape[:2], field)
+    shown, distances = resize_view(image, size), sample_cells(depth, size)
+    with torch.inference_mode():
+        views = to_network_input(shown[None], compute_tangents(image.shape[:2], size)[None], distances[None])
+        logits, states = labeller._network(views)
+        confidence, category = (each[0].numpy() for each in logits.permute(0, 2, 3, 1).softmax(dim=3).max(dim=3))
+    impossible = find_impossible_states(labeller.categories, labeller.card["states"])[category]
+    state = np.where(impossible, -np.inf, states[0].permute(1, 2, 0).numpy()).argmax(axis=2)
+    rows, columns = (np.arange(n) * cells // n for n, cells in zip(depth.shape, (size.height, size.width), strict=True))
+    where = np.ix_(rows, columns)
+    return SceneLabels(
+        category[where][None].astype(np.uint8), confidence[where][None], state[where][None].astype(np.uint8)
+    )
+
+
+@pytest.mark.parametrize("which", ["small", "shipped"])
+@pytest.mark.parametrize(("size", "field"), VIEWS)
+def test_labels_are_those_of_the_likeliest_logits(
+    which: str, small: LearnedLabeller, size: tuple[int, int], field: float
+) -> None:
+    labeller = small if which == "small" else LearnedLabeller()
+    rng = np.random.default_rng(4)
+    image = rng.integers(0, 256, (*size, 3), np.uint8)
+    depth = rng.uniform(-1, 5, size).clip(0).astype(np.float32)
+    with single_thread():
+        expected = label_plainly(labeller, image, depth, field)
+    assert as_bytes(labeller.label(image[None], field, depth=depth[None])) == as_bytes(expected)
+
+
+def test_bytes_become_values_from_minus_one_to_one() -> None:
+    view = np.random.default_rng(5).integers(0, 256, (1, 32, 64, 3), np.uint8)
+    found = to_network_input(view, np.zeros((1, 16, 32, 2), np.float32)).permute(0, 2, 3, 1)[0].numpy()
+    for row, column in ((0, 0), (3, 30), (15, 31)):
+        cell = view[0, 2 * row : 2 * row + 2, 2 * column : 2 * column + 2].ravel()
+        np.testing.assert_array_equal(found[row, column, :12], (cell * (1 / 127.5)).astype(np.float32) - 1)
+        assert not found[row, column, 12:].any()
 
 
 def test_only_possible_states_are_named(small: LearnedLabeller) -> None:

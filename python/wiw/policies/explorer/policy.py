@@ -140,20 +140,15 @@ class Explorer(Policy):
     def _look_at_surfaces(self, views: Views, labels: SceneLabels) -> list[Surface]:
         """Return looks at floors and walls: patches that are all of one surface, with their colour."""
         looks, categories = [], self.labeller.categories
-        half = SURFACE_STRIDE // 2
         for name in SURFACES:
             if name not in categories:
                 continue
             mask = (labels.category == categories.index(name)) & (views.depth > 0)
-            height, width = views.size
-            for view in range(len(mask)):
-                for row in range(half, height - half, SURFACE_STRIDE):
-                    for column in range(half, width - half, SURFACE_STRIDE):
-                        patch = np.s_[view, row - half // 2 : row + half // 2, column - half // 2 : column + half // 2]
-                        if mask[patch].all():
-                            color, confidence = self.name_color(views.images[patch].reshape(-1, 3), name)
-                            point = unproject(views, *(np.array([i]) for i in (view, row, column)))[0]
-                            looks.append(Surface(name, point[:2], color, confidence))
+            view, rows, columns = _find_patches(mask)
+            patches = views.images[_spread_patches(view, rows, columns)]
+            for pixels, point in zip(patches, unproject(views, view, rows, columns), strict=True):
+                color, confidence = self.name_color(pixels.reshape(-1, 3), name)
+                looks.append(Surface(name, point[:2], color, confidence))
         return looks
 
     def _mark_refused(self, situation: Situation) -> None:
@@ -288,6 +283,22 @@ class Explorer(Policy):
         memory = situation.memory
         left = self.budget - len(situation.executed)
         return bool(memory.belief.confidence >= self.sure or not memory.destinations or left <= LAST_ACTIONS)
+
+
+def _find_patches(mask: NDArray[np.bool_]) -> tuple[NDArray[np.intp], NDArray[np.intp], NDArray[np.intp]]:
+    """Return the middles, view, row and column, of the patches that a mask [V, H, W] is true all over."""
+    middles = [np.arange(SURFACE_STRIDE // 2, side - SURFACE_STRIDE // 2, SURFACE_STRIDE) for side in mask.shape[1:]]
+    view, rows, columns = (each.ravel() for each in np.meshgrid(np.arange(len(mask)), *middles, indexing="ij"))
+    whole = mask[_spread_patches(view, rows, columns)].all(axis=(1, 2))
+    return view[whole], rows[whole], columns[whole]
+
+
+def _spread_patches(
+    view: NDArray[np.intp], rows: NDArray[np.intp], columns: NDArray[np.intp]
+) -> tuple[NDArray[np.intp], ...]:
+    """Return the indices into views of the pixels of N patches with these middles; they give [N, side, side]."""
+    side = np.arange(-(SURFACE_STRIDE // 4), SURFACE_STRIDE // 4)
+    return view[:, None, None], rows[:, None, None] + side[:, None], columns[:, None, None] + side
 
 
 def _take(labels: SceneLabels, first: int, count: int) -> SceneLabels:
