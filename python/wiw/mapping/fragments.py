@@ -29,6 +29,8 @@ SPARSE = 100
 """Voxels of a thing below which what is seen of it from above is widened by one, so that gaps of 0.1 m are closed."""
 SCRAP = 0.15
 """Share of the largest part's voxels below which a part is none."""
+LEAST_COLUMN = 0.7
+"""Share of the usual mean of the votes below which a column of what hangs on a wall is the wall between two things."""
 _OFFSET = 1 << 15
 _SHIFT = 16
 
@@ -161,6 +163,29 @@ def split_voxels(keys: NDArray[np.int64]) -> list[NDArray[np.int64]]:
     owner = away.argmin(axis=0)
     found = [keys[owner == number] for number in range(len(parts))]
     return sorted(found, key=lambda own: (-len(own), int(own[0])))
+
+
+def split_along_wall(keys: NDArray[np.int64], shares: NDArray[np.float64]) -> list[NDArray[np.int64]]:
+    """Return the parts of what hangs on a wall between which views mostly saw the wall, the largest first.
+
+    Scraps are left out.
+
+    Args:
+        keys: sorted keys of its voxels.
+        shares: float64 [N], of the votes for each voxel those that say what the thing is.
+    """
+    places = np.floor(unpack_voxels(keys)[:, :2] / VOXEL).astype(np.intp)
+    column = places[:, int(np.ptp(places, axis=0).argmax())]
+    column = column - column.min()
+    count = np.bincount(column)
+    mean = np.bincount(column, shares) / np.maximum(count, 1)
+    solid = mean >= LEAST_COLUMN * np.median(mean[count > 0])
+    run = np.cumsum(np.diff(solid, prepend=False) & solid) * solid  # 1 or more within a run, 0 between
+    sizes = np.bincount(run, count)
+    sizes[0] = 0
+    kept = np.flatnonzero(sizes >= max(1.0, SCRAP * sizes.max()))
+    found = [keys[run[column] == number] for number in kept if number]
+    return sorted(found, key=lambda own: (-len(own), int(own[0]))) or [keys]
 
 
 def _find_parts(points: NDArray[np.float64]) -> list[NDArray[np.float64]]:

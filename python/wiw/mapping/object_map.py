@@ -41,6 +41,8 @@ COLOR_PIXELS = 256
 """Pixels at most that a fragment's colour is named from."""
 BACKGROUND = ("", "wall", "floor", "ceiling", "door frame", "unknown", "misc", "other")
 """Categories that are not things; they are never mapped."""
+ON_WALLS = frozenset({"picture", "mirror", "clock", "wall shelf", "photo", "television"})
+"""Categories that hang close to each other and on both sides of a wall; they must fill the same space as well."""
 CONFUSABLE: tuple[frozenset[str], ...] = (
     frozenset({"armchair", "sofa"}),
     frozenset({"chair", "office chair", "dining chair", "armchair"}),
@@ -270,7 +272,8 @@ class ObjectMap:
         near = (new.box[0] <= boxes[:, 1] + NEAR).all(axis=1) & (boxes[:, 0] <= new.box[1] + NEAR).all(axis=1)
         found = []
         for row in np.flatnonzero(near & (least <= 1)).tolist():
-            overlap = measure_overlap(new, known[row], mutual=least[row] > OVERLAP)
+            narrow = known[row].category in ON_WALLS
+            overlap = measure_overlap(new, known[row], mutual=least[row] > OVERLAP, narrow=narrow)
             if least[row] == OVERLAP and _measure_inside(new, known[row]) >= INSIDE:
                 overlap = max(overlap, OVERLAP)
             if overlap >= least[row]:
@@ -346,13 +349,14 @@ class ObjectMap:
         return len(self.find(category, least_size))
 
 
-def measure_overlap(one: MapObject, other: MapObject, mutual: bool = False) -> float:
+def measure_overlap(one: MapObject, other: MapObject, mutual: bool = False, narrow: bool = False) -> float:
     """Return the share of voxels of one that lie near the other's, or the other way round if that is more.
 
-    `mutual`: if that is less, so that both must fill the same space.
+    `mutual`: if that is less, so that both must fill the same space. `narrow`: near means in the same space, as it does
+    for small things.
     """
     small = max(float(thing.extent.max()) for thing in (one, other)) <= SMALL
-    reach = SAME_SPACE if mutual or small else NEAR
+    reach = SAME_SPACE if mutual or small or narrow else NEAR
     shares = _measure_share(one, other, reach), _measure_share(other, one, reach)
     return min(shares) if mutual else max(shares)
 

@@ -20,16 +20,17 @@ APARTMENTS = 200
 
 
 def count_homes(tables: Sequence[SceneTable]) -> dict[str, dict[str, object]]:
-    """Return shares of rooms by kind, mean numbers of things by kind and category, commonest materials, and sides."""
+    """Return shares of rooms by kind, mean numbers of things by kind and category, commonest materials, and sizes."""
     rooms, contents = Counter[str](), defaultdict[str, Counter[str]](Counter)
-    materials, sides = defaultdict[str, Counter[str]](Counter), defaultdict[str, list[list[float]]](list)
+    materials, sizes = defaultdict[str, Counter[str]](Counter), defaultdict[str, list[list[float]]](list)
     for table in tables:
         rooms.update(room.kind for room in table.rooms)
         for thing in table.things:
             material = MATERIALS.get(thing.material, thing.material)
             materials[thing.category][material] += 1
             materials[f"{thing.category}/{thing.color}"][material] += 1
-            sides[thing.category].append(sorted((thing.high - thing.low)[[0, 2]].tolist(), reverse=True))
+            width, height, depth = (thing.high - thing.low).tolist()
+            sizes[thing.category].append([max(width, depth), min(width, depth), height])
             if thing.category not in STRUCTURE and (kind := table.kind_of(thing.room)):
                 contents[kind][thing.category] += 1
     total = sum(rooms.values())
@@ -42,7 +43,7 @@ def count_homes(tables: Sequence[SceneTable]) -> dict[str, dict[str, object]]:
         "materials": {
             name: min(c.items(), key=lambda item: (-item[1], item[0]))[0] for name, c in sorted(materials.items())
         },
-        "sides": {name: np.median(found, axis=0).round(3).tolist() for name, found in sorted(sides.items())},
+        "sizes": {name: np.median(found, axis=0).round(3).tolist() for name, found in sorted(sizes.items())},
     }
 
 

@@ -242,6 +242,17 @@ def test_a_cup_beside_a_vase_stays_a_cup_and_a_cup_called_a_vase_does_not_become
     assert objects.count("cup") == 1
 
 
+@pytest.mark.parametrize(("category", "count"), [("chair", 1), ("picture", 2)])
+def test_pictures_on_both_sides_of_a_wall_are_two(category: str, count: int) -> None:
+    objects = ObjectMap(("", "wall", category))
+    for away in (3.0, 3.13):
+        views = blank_views()
+        kinds = np.ones(views.depth.shape, np.uint8)
+        add_square(views, kinds, 2, (away, 0.0, 1.5), 0.35)
+        objects.add(views, labels_of(kinds))
+    assert len(objects.objects) == count
+
+
 def test_the_map_is_a_function_of_its_inputs() -> None:
     tour = Tour("apartments:val/3", 4)
     one, other = add_all(tour), add_all(tour)

@@ -30,14 +30,15 @@ from wiw.experiments.privileged_explorers import (
 from wiw.loop.memory import Query
 from wiw.loop.privileged import LiveEnvironments
 from wiw.loop.scheduler import run_episodes
-from wiw.mapping.fragments import pack_voxels
+from wiw.mapping.fragments import pack_voxels, split_along_wall, unpack_voxels
 from wiw.mapping.object_map import MapObject, ObjectMap
 from wiw.mapping.occupancy import OccupancyGrid
+from wiw.mapping.views import Views, place_cameras, unproject
 from wiw.perception.scene_labels import CATEGORIES, STATES, Labeller, SceneLabels
 from wiw.policies.explorer import confidence
 from wiw.policies.explorer.answering import answer, list_wanted
-from wiw.policies.explorer.home import KNOWLEDGE, Home, believe_home, load_knowledge, to_table_frame
-from wiw.policies.explorer.policy import Explorer
+from wiw.policies.explorer.home import KNOWLEDGE, Home, Surface, believe_home, load_knowledge, to_table_frame
+from wiw.policies.explorer.policy import SURFACE_STRIDE, SURFACES, Explorer
 from wiw.policies.explorer.presuming import find_likeliest
 from wiw.runs.recipes import AgentRecipe, TaskRecipe
 from wiw.scenes import apartment_table
@@ -104,6 +105,49 @@ def test_knowledge_is_counted_in_train_apartments(tmp_path):
 def test_the_table_has_the_axes_of_scenes():
     forward, left, up = to_table_frame(np.eye(3))
     assert forward.tolist() == [0, 0, -1] and left.tolist() == [-1, 0, 0] and up.tolist() == [0, 1, 0]
+
+
+# -- floors and walls --------------------------------------------------------------------------------------------------
+
+
+def look_plainly(explorer: Explorer, views: Views, labels: SceneLabels) -> list[Surface]:
+    """Look at floors and walls patch by patch."""
+    looks, half = [], SURFACE_STRIDE // 2
+    for name in SURFACES:
+        mask = (labels.category == CATEGORIES.index(name)) & (views.depth > 0)
+        for view in range(len(mask)):
+            for row in range(half, views.size[0] - half, SURFACE_STRIDE):
+                for column in range(half, views.size[1] - half, SURFACE_STRIDE):
+                    patch = np.s_[view, row - half // 2 : row + half // 2, column - half // 2 : column + half // 2]
+                    if mask[patch].all():
+                        color, confidence = explorer.name_color(views.images[patch].reshape(-1, 3), name)
+                        point = unproject(views, *(np.array([i]) for i in (view, row, column)))[0]
+                        looks.append(Surface(name, point[:2], color, confidence))
+    return looks
+
+
+@pytest.mark.parametrize("size", [(192, 224), (97, 61), (20, 20)])
+def test_looks_at_surfaces_are_patches_of_one_surface(monkeypatch, size):
+    def weigh(pixels: np.ndarray, category: str) -> tuple[str, float]:
+        assert pixels.dtype == np.uint8 and pixels.shape == ((SURFACE_STRIDE // 2) ** 2, 3)
+        return category, float(np.arange(pixels.size) @ pixels.ravel())  # tells any order of the pixels
+
+    monkeypatch.setattr("wiw.policies.explorer.policy.name_color", weigh)
+    rng = np.random.default_rng(0)
+    images = rng.integers(0, 256, (4, *size, 3), np.uint8)
+    depth = rng.uniform(0.5, 5, (4, *size)).astype(np.float32)
+    depth[rng.random(depth.shape) < 0.001] = 0
+    category = np.zeros((4, *size), np.uint8)
+    category[:, : size[0] // 2], category[:, size[0] // 2 :] = (CATEGORIES.index(name) for name in ("wall", "floor"))
+    category[rng.random(category.shape) < 0.001] = CATEGORIES.index("sofa")
+    views = Views(images, depth, place_cameras(np.array([1.0, -2.0, 0.7])), np.array([1.0, -2.0, 0.7]))
+    labels = SceneLabels(category, np.ones(depth.shape, np.float32), np.zeros_like(category))
+    explorer = Explorer(perception=RedIsASofa())
+    found, expected = explorer._look_at_surfaces(views, labels), look_plainly(explorer, views, labels)
+    assert (len(found) > 20 and {look.category for look in found} == set(SURFACES)) or size != (192, 224)
+    assert [(each.category, each.position.tolist(), each.color, each.weight) for each in found] == [
+        (each.category, each.position.tolist(), each.color, each.weight) for each in expected
+    ]
 
 
 # -- from the map to a home -------------------------------------------------------------------------------------------
@@ -186,7 +230,42 @@ def test_thin_things_are_believed_in_with_less_support():
         voxels = pack_voxels(np.array([[float(number), 0.0, 0.5]]))
         objects._objects[number] = MapObject(number, voxels, own, votes, (), category, "", "", 0.1, 1.0, 1, 0, 0)
     home = believe_home(objects, OccupancyGrid(), [], load_knowledge())
-    assert [thing.category for thing in home.table.things] == ["picture", "cup"]
+    assert [thing.category for thing in home.objects.values()] == ["picture", "cup"]
+
+
+# -- how much of a thing was seen --------------------------------------------------------------------------------------
+
+
+def test_scraps_are_no_things_until_a_question_speaks_of_one():
+    """The edge of a wardrobe is taken for a second sofa; a question about the sofa means the whole one."""
+    objects, grid = make_boxes("sofa", ((0, 1.9), (0, 0.9)), ((4, 4.15), (0, 0.1)))
+    home = believe_home(objects, grid, [], load_knowledge())
+    assert [thing.id for thing in home.table.things] == [1] and [thing.id for thing in home.scraps] == [2]
+    assert set(home.objects) == {1, 2}  # it is worth another look
+
+    objects, grid = make_boxes("sofa", ((4, 4.15), (0, 0.1)))
+    objects._objects[1] = replace(objects[1], color="red")
+    home = believe_home(objects, grid, [], load_knowledge())
+    assert home.table.things == ()
+    text = "What color is the sofa?"
+    assert answer(parse(text), text, home, grid).text == "red"
+
+
+def test_pictures_side_by_side_have_wall_between_them():
+    axes = [np.arange(low, high, 0.05) + 0.025 for low, high in ((0.0, 1.3), (0.0, 0.05), (1.0, 1.5))]
+    points = np.stack(np.meshgrid(*axes), axis=-1).reshape(-1, 3)
+    keys = np.sort(pack_voxels(points))
+    along = unpack_voxels(keys)[:, 0]
+    shares = np.where((along > 0.6) & (along < 0.7), 0.4, 0.95)
+    parts = split_along_wall(keys, shares)
+    assert [round(float(np.ptp(unpack_voxels(part)[:, 0]) + 0.05), 2) for part in parts] == [0.6, 0.6]
+    assert split_along_wall(keys, np.full(len(keys), 0.5))[0].tolist() == keys.tolist()  # unsure, but of one piece
+
+
+def test_a_material_is_that_of_things_in_the_colour():
+    known = replace(load_knowledge(), materials={"desk": "wood", "desk/red": "lacquer"})
+    assert known.name_material("desk", "red") == "lacquer"
+    assert known.name_material("desk", "blue") == "wood" and known.name_material("sofa", "red") == ""
 
 
 def test_a_labeller_says_which_of_its_labels_are_mapped():

@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from wiw.datasets.questions.facts import FRONTED, HUNG, SMALL, Room, SceneTable, Thing
-from wiw.mapping.fragments import split_voxels
+from wiw.mapping.fragments import VOXEL, split_along_wall, split_voxels
 from wiw.mapping.object_map import MapObject, ObjectMap
 from wiw.mapping.occupancy import OccupancyGrid
 
@@ -35,6 +35,9 @@ THIN = SMALL | HUNG - {"wall shelf"} | {"rug"}
 """Categories whose voxels are partly those of what they stand on or hang on; less will do for them."""
 LEAST_KEPT = 0.1
 """Share of a thing's voxels that must be left."""
+
+LEAST_SURFACE, LEAST_SMALL_SURFACE = 0.12, 0.2
+"""Share of its category's usual surface that must be seen of a thing, and of one in `SMALL`."""
 
 WORKTOPS = frozenset({"kitchen counter", "kitchen cabinet"})
 """Categories that stand against walls and have no left and right."""
@@ -69,13 +72,22 @@ class Knowledge:
     """By kind of room, then by category: how many a room has on average."""
     materials: Mapping[str, str]
     """By category, the most common material."""
-    sides: Mapping[str, Sequence[float]]
-    """By category, the medians of the longer and of the shorter horizontal side in metres."""
+    sizes: Mapping[str, Sequence[float]]
+    """By category, the medians of the longer and the shorter horizontal side and of the height in metres."""
 
     @property
     def kinds(self) -> tuple[str, ...]:
         """Kinds of rooms, sorted."""
         return tuple(sorted(self.rooms))
+
+    def name_material(self, category: str, color: str) -> str:
+        """Return the most common material of a category, of things in a colour where homes have some."""
+        return self.materials.get(f"{category}/{color}", self.materials.get(category, ""))
+
+    def measure_surface(self, category: str) -> float:
+        """Return the usual surface of a category, as far as views show it: its top and two of its sides, in m^2."""
+        longer, shorter, height = self.sizes.get(category, (0.0, 0.0, 0.0))
+        return longer * shorter + (longer + shorter) * height
 
     def judge_room(self, counts: Mapping[str, int]) -> NDArray[np.float64]:
         """Return the probability of each kind for a room with these things in it (naive Bayes, Poisson counts)."""
@@ -106,11 +118,13 @@ class Home:
 
     table: SceneTable
     objects: Mapping[int, MapObject]
-    """By id of the table's things; floors and walls have none."""
+    """By id of the table's things and of the scraps; floors and walls have none."""
     room_names: Mapping[int, str]
     """By number of the grid's rooms."""
     room_kinds: Mapping[str, Mapping[str, float]]
     """Probability of each kind, by the room's name."""
+    scraps: tuple[Thing, ...] = ()
+    """What was seen too little of to be in the table: a part of a thing, or the edge of another. `objects` has them."""
 
     def weigh(self, thing: Thing) -> float:
         """Return the evidence for a thing of the table: how large it was seen, and how surely as what it is."""
@@ -127,17 +141,26 @@ def believe_home(objects: ObjectMap, grid: OccupancyGrid, surfaces: Sequence[Sur
         and thing.category_share >= LEAST_SHARE
         and objects.measure_support(thing) >= (LEAST_THIN_SUPPORT if thing.category in THIN else LEAST_SUPPORT)
     ]
-    seen = _take_apart(_put_together(_drop_strays(known, objects), objects, knowledge), knowledge)
+    seen = _take_apart(_put_together(_drop_strays(known, objects), objects, knowledge), objects, knowledge)
     places = {thing.id: grid.find_room(thing.points) for thing in seen}
-    rooms, names, kinds = _name_rooms(seen, places, grid, knowledge)
-    things = [_make_thing(thing, names.get(places[thing.id], ""), grid, knowledge) for thing in seen]
+    whole = {thing.id for thing in seen if _is_whole(thing, knowledge)}
+    rooms, names, kinds = _name_rooms([thing for thing in seen if thing.id in whole], places, grid, knowledge)
+    made = [_make_thing(thing, names.get(places[thing.id], ""), grid, knowledge) for thing in seen]
+    things = [thing for thing in made if thing.id in whole]
     things += _make_surfaces(surfaces, grid, names, knowledge, first=max(places, default=0) + 1)
-    return Home(SceneTable("", tuple(things), tuple(rooms)), {thing.id: thing for thing in seen}, names, kinds)
+    scraps = tuple(thing for thing in made if thing.id not in whole)
+    return Home(SceneTable("", tuple(things), tuple(rooms)), {thing.id: thing for thing in seen}, names, kinds, scraps)
 
 
 def to_table_frame(points: NDArray[np.float64]) -> NDArray[np.float64]:
     """Return points (x forward, y left, z up) in the axes of scene tables, which have Y up and look down -Z."""
     return np.asarray(np.stack([-points[..., 1], points[..., 2], -points[..., 0]], axis=-1))
+
+
+def _is_whole(thing: MapObject, knowledge: Knowledge) -> bool:
+    """Return whether enough of a thing was seen to be one of its category; the edges of others are taken for scraps."""
+    least = LEAST_SMALL_SURFACE if thing.category in SMALL else LEAST_SURFACE
+    return len(thing.voxels) * VOXEL**2 >= least * knowledge.measure_surface(thing.category)
 
 
 def _drop_strays(things: Sequence[MapObject], objects: ObjectMap) -> list[MapObject]:
@@ -170,26 +193,30 @@ def _put_together(things: Sequence[MapObject], objects: ObjectMap, knowledge: Kn
 
 def _may_be_one(thing: MapObject, other: MapObject, knowledge: Knowledge) -> bool:
     """Whether two things of one category touch, and fit together into the usual size of one."""
-    usual = knowledge.sides.get(thing.category)
+    usual = knowledge.sizes.get(thing.category)
     if usual is None or thing.category in SMALL:
         return False
     if (np.maximum(other.box[0] - thing.box[1], thing.box[0] - other.box[1]) > APART).any():
         return False
     low, high = np.minimum(thing.bounds[0], other.bounds[0]), np.maximum(thing.bounds[1], other.bounds[1])
     factor, more = ONE_SIZE
-    return bool((np.sort((high - low)[:2])[::-1] <= factor * np.array(usual) + more).all())
+    return bool((np.sort((high - low)[:2])[::-1] <= factor * np.array(usual[:2]) + more).all())
 
 
-def _take_apart(things: Sequence[MapObject], knowledge: Knowledge) -> list[MapObject]:
-    """Return the things, those that are too long for one and do not hang together as several, with new ids.
+def _take_apart(things: Sequence[MapObject], objects: ObjectMap, knowledge: Knowledge) -> list[MapObject]:
+    """Return the things, those that are several as several, with new ids.
 
-    Chairs around a table are one fragment in a view across it, and one thing of the map from then on.
+    Chairs around a table are one fragment in a view across it, and one thing of the map from then on; so are pictures
+    side by side. The former do not hang together and are too long for one; the latter have wall between them.
     """
     found, unused = list[MapObject](), max((thing.id for thing in things), default=0) + 1
     for thing in things:
         length = float(np.ptp(thing.points[:, :2], axis=0).max())
         parts = [thing.voxels]
-        if length > TOO_LONG * knowledge.sides.get(thing.category, (np.inf,))[0]:
+        if thing.category in HUNG:
+            category = objects.categories.index(thing.category)
+            parts = split_along_wall(thing.voxels, objects.votes.measure_shares(thing.voxels, category))
+        elif length > TOO_LONG * knowledge.sizes.get(thing.category, (np.inf,))[0]:
             parts = split_voxels(thing.voxels)
         found.append(replace(thing, voxels=parts[0]))
         for part in parts[1:]:
@@ -222,13 +249,13 @@ def _make_thing(thing: MapObject, room: str, grid: OccupancyGrid, knowledge: Kno
     low, high, front = corners.min(axis=0), corners.max(axis=0), np.array([0.0, 0.0, 1.0])
     if thing.category in FRONTED | WORKTOPS:
         front = _find_front(thing, grid)
-        low, high = _complete_bounds(low, high, front, knowledge.sides.get(thing.category, (0.0, 0.0))[1])
+        low, high = _complete_bounds(low, high, front, knowledge.sizes.get(thing.category, (0.0, 0.0))[1])
     return Thing(
         id=thing.id,
         name=f"{thing.category} {thing.id}",
         category=thing.category,
         color=thing.color,
-        material=knowledge.materials.get(thing.category, ""),
+        material=knowledge.name_material(thing.category, thing.color),
         state=thing.state,
         room=room,
         low=low,
@@ -282,8 +309,8 @@ def _make_surfaces(
     for number, ((category, room), colors) in enumerate(sorted(votes.items())):
         if room:
             color = max(sorted(colors), key=lambda name: colors[name])
-            material = knowledge.materials.get(f"{category}/{color}", knowledge.materials.get(category, ""))
             nowhere = np.zeros(3)
             name = f"{category} of {room}"
+            material = knowledge.name_material(category, color)
             made.append(Thing(first + number, name, category, color, material, "", room, nowhere, nowhere, nowhere))
     return made
