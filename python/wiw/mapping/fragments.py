@@ -184,7 +184,7 @@ def split_along_wall(keys: NDArray[np.int64], shares: NDArray[np.float64]) -> li
     sizes = np.bincount(run, count)
     sizes[0] = 0
     kept = np.flatnonzero(sizes >= max(1.0, SCRAP * sizes.max()))
-    found = [keys[run[column] == number] for number in kept if number]
+    found = [keys[run[column] == number] for number in kept]
     return sorted(found, key=lambda own: (-len(own), int(own[0]))) or [keys]
 
 

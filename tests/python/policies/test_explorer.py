@@ -227,10 +227,12 @@ def test_thin_things_are_believed_in_with_less_support():
     for number, category in enumerate(("sofa", "picture", "cup"), start=1):
         own = votes.copy()
         own[CATEGORIES.index(category)] = 1.0
-        voxels = pack_voxels(np.array([[float(number), 0.0, 0.5]]))
+        voxels = np.unique(
+            pack_voxels(np.array([number, 0.0, 0.5]) + 0.05 * (np.indices((8, 8, 8)).reshape(3, -1).T + 0.5))
+        )
         objects._objects[number] = MapObject(number, voxels, own, votes, (), category, "", "", 0.1, 1.0, 1, 0, 0)
     home = believe_home(objects, OccupancyGrid(), [], load_knowledge())
-    assert [thing.category for thing in home.objects.values()] == ["picture", "cup"]
+    assert [thing.category for thing in home.table.things] == ["picture", "cup"]
 
 
 # -- how much of a thing was seen --------------------------------------------------------------------------------------

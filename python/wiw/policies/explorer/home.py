@@ -124,7 +124,7 @@ class Home:
     room_kinds: Mapping[str, Mapping[str, float]]
     """Probability of each kind, by the room's name."""
     scraps: tuple[Thing, ...] = ()
-    """What was seen too little of to be in the table: a part of a thing, or the edge of another. `objects` has them."""
+    """Parts of things and edges of others, of which too little was seen for the table. `objects` has them."""
 
     def weigh(self, thing: Thing) -> float:
         """Return the evidence for a thing of the table: how large it was seen, and how surely as what it is."""

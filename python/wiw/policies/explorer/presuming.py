@@ -31,8 +31,10 @@ LEAST_KIND = 0.02
 
 def find_likeliest(home: Home, question: ParsedQuestion) -> Fact | None:
     """Return the best supported answer to a question: what hinders one is left out, the weakest first."""
-    with_scraps = replace(home, table=replace(home.table, things=home.table.things + home.scraps))
-    for believed in (home, with_scraps):
+    homes = [home]
+    if home.scraps:
+        homes.append(replace(home, table=replace(home.table, things=home.table.things + home.scraps)))
+    for believed in homes:
         for table in _drop_weak_things(believed, question, assume_named_things(believed, question)):
             fact = find_answer(table, question.template, question.slots)
             if fact is not None:
