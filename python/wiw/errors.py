@@ -122,7 +122,7 @@ class WeightsError(Error):
 
 
 class DeviceMemoryError(InfrastructureError):
-    """The accelerator's memory is full. The message names the options that need less of it."""
+    """The memory of the device, accelerator or CPU, is full. The message names the options that need less of it."""
 
 
 class RolloutError(InfrastructureError):

@@ -43,8 +43,8 @@ def has_bfloat16() -> bool:
     return bool(torch.ops.mkldnn._is_mkldnn_bf16_supported())
 
 
-OUT_OF_MEMORY_WORDS = ("out of memory", "ALLOC_FAILED")
-"""Error texts of CUDA and its libraries for a full GPU, where they allocate memory past torch's allocator."""
+OUT_OF_MEMORY_WORDS = ("out of memory", "ALLOC_FAILED", "can't allocate memory")
+"""Error texts of CUDA and its libraries where they allocate memory past torch's allocator, and of main memory."""
 
 
 @contextmanager
@@ -58,13 +58,13 @@ def memory_guard(what: str, cures: str) -> Iterator[None]:
 
     try:
         yield
-    except RuntimeError as error:
-        if not isinstance(error, torch.OutOfMemoryError) and not any(
-            said in str(error) for said in OUT_OF_MEMORY_WORDS
-        ):
+    except (RuntimeError, MemoryError) as error:
+        full = isinstance(error, torch.OutOfMemoryError | MemoryError)
+        if not full and not any(said in str(error) for said in OUT_OF_MEMORY_WORDS):
             raise
         torch.cuda.empty_cache()
-        raise DeviceMemoryError(f"{what} does not fit on the device ({str(error).splitlines()[0]}); {cures}") from error
+        said = (str(error).splitlines() or ["out of memory"])[0]
+        raise DeviceMemoryError(f"{what} does not fit into the device's memory ({said}); {cures}") from error
 
 
 def in_hub_cache(repository: str) -> bool:

@@ -146,7 +146,19 @@ def train(out, **_):
     checkpoint.remove()
 
 
-WORK = {function.__name__: function for function in (evaluate, report, export, merge, collect, train)}
+def post_train(out, data, validation, weights, **_):
+    import torch
+    from post_training_parts import tiny_recipe
+
+    from wiw.training.post_training.train import post_train
+
+    torch.set_num_threads(1)
+    recipe = tiny_recipe("ltx-action", epochs=3, validate_every=2, validate_clips=1)
+    options = {"weights": weights, "device": "cpu", "part": "all", "validation": validation, "seconds": 0}
+    post_train("ltx-action", data, Path(out) / "ltx", recipe=recipe, **options)
+
+
+WORK = {function.__name__: function for function in (evaluate, report, export, merge, collect, train, post_train)}
 IMPORTS = (
     *("fakes", "wiw.loop.scheduler", "wiw.studies.evaluate"),
     *("wiw.report.export", "wiw.report.page", "wiw.report.site", "wiw.report.recording"),

@@ -44,7 +44,12 @@ SCENES = ("flat", "loft", "house")
 
 
 def save_dataset(
-    folder: Path, frames: int = 12, projection: str = "equirectangular", scenes: Sequence[str] = SCENES
+    folder: Path,
+    frames: int = 12,
+    projection: str = "equirectangular",
+    scenes: Sequence[str] = SCENES,
+    height: float = 1.0,
+    split: str = "train",
 ) -> Path:
     """Coloured panoramas that brighten ahead and roll with turns, in the files of `wiw collect navigation`."""
     folder.mkdir(parents=True, exist_ok=True)
@@ -53,8 +58,8 @@ def save_dataset(
     write_frames(folder / "frames.parquet", schema, [build_table(each, schema) for each in segments])
     rows = [_list_segment(each, group) for group, each in enumerate(segments)]
     write_segment_list(folder / SEGMENTS, rows)
-    camera = {"projection": projection, "size": [64, 128], "height_m": 1.0}
-    meta = {"format": FORMAT, "camera": camera, "files": {"frames.parquet": {"sha256": "0"}}}
+    camera = {"projection": projection, "size": [64, 128], "height_m": height}
+    meta = {"format": FORMAT, "split": split, "camera": camera, "files": {"frames.parquet": {"sha256": "0"}}}
     (folder / META).write_text(json.dumps(meta))
     (folder / MANIFEST).write_text(json.dumps({"what": "navigation"}))
     return folder
@@ -204,7 +209,7 @@ def run_in_a_process(work: Callable[..., Any], *arguments: Any, **options: Any) 
 
 
 def train_until_killed(step: int, *arguments: Any, **options: Any) -> None:
-    """Post-train, with the state written after each step, and die at one of them."""
+    """Post-train, with the state written after each step, and die at one of them, before its state is written."""
 
     def die(now: int, *_: Any) -> None:
         if now == step:

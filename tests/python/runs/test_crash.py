@@ -24,8 +24,8 @@ from wiw.runs.store import RunStore
 from wiw.runs.store_file import store_path
 from wiw.studies.run_log import load_run
 
-KILLS = [(20, 4, 16), pytest.param((1500, 200, 300), marks=[pytest.mark.nightly, pytest.mark.timeout(7200)])]
-"""Kills of runs, of each shard, and of exports: 44 for every change, 2,200 nightly."""
+KILLS = [(20, 4, 16, 4), pytest.param((1500, 200, 300, 50), marks=[pytest.mark.nightly, pytest.mark.timeout(7200)])]
+"""Kills of runs, of each shard, of exports, and of collections: 48 for every change, 2,250 nightly."""
 
 
 def facts(run):
@@ -136,6 +136,28 @@ def test_exports_killed_at_random_moments_leave_all_or_nothing(victims, referenc
         assert victims.run("export", reference, kind=kind, target=str(target)) == 0
         assert [path.name for path in target.parent.iterdir()] == [name]  # what the killed had begun is swept away
     assert store_path(reference).read_bytes() == before
+
+
+@pytest.mark.parametrize("kills_of", KILLS)
+def test_collections_killed_at_random_moments_lose_a_segment_at_most(tmp_path, two_rooms, kills_of):
+    pytest.importorskip("pyarrow", reason="needs wiw[export]")
+    victims, draw, kills, datasets = Victims(imports=("wiw.training.collect_navigation",)), random.Random(3), 0, 0
+    whole_time = seconds(victims, "collect", tmp_path / "whole", scene=two_rooms)
+    expected = contents(tmp_path / "whole")
+    while kills < kills_of[3]:
+        out, kept, here = tmp_path / f"data{datasets}", {}, 0
+        datasets += 1
+        while here < 5 and victims.run("collect", out, scene=two_rooms, kill_after=draw.uniform(0, whole_time)) != 0:
+            kills, here = kills + 1, here + 1
+            parts = {path: path.stat().st_mtime_ns for path in out.glob("parts/*/*.parquet")}
+            finished = len(list(out.glob("data/*.parquet")))
+            assert finished or kept.items() <= parts.items(), "a complete segment was recorded again, or lost"
+            kept = parts
+        whole_time *= 0.9 if here < 5 else 1.0  # the machine may have become faster
+        assert victims.run("collect", out, scene=two_rooms) == 0, victims.said
+        assert contents(out) == expected
+        shutil.rmtree(out)
+    victims.close()
 
 
 def same(kind, found, expected):

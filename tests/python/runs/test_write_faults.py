@@ -7,7 +7,9 @@ Every write of every job fails nightly; otherwise a few, evenly spread.
 
 from __future__ import annotations
 
+import importlib.util
 import itertools
+import json
 import shutil
 import sqlite3
 from collections.abc import Callable, Mapping
@@ -47,7 +49,7 @@ def victims(tmp_path_factory: pytest.TempPathFactory) -> Any:
     pytest.importorskip("pyarrow", reason="needs wiw[export]")
     pytest.importorskip("torch", reason="needs wiw[torch]")
     library = build_faults(tmp_path_factory.mktemp("library"))
-    jobs = ("wiw.runs.merge", "wiw.training.collect_navigation", "test_train_navigator")
+    jobs = ("wiw.runs.merge", "wiw.training.collect_navigation", "test_train_navigator", "post_training_parts")
     imports = (*jobs, "wiw.policies.navigator.weights", "torch._dynamo")
     server = Victims(library, imports, WIW_NUM_THREADS="1")
     yield server
@@ -74,7 +76,26 @@ def works(tmp_path_factory: pytest.TempPathFactory, two_rooms: str) -> dict[str,
         "report": Work("report", read_files, {"out": str(run)}, target="report.html"),
         "collect": Work("collect", read_files, {"scene": two_rooms}),
         "train": Work("train", read_files),
+        "post-train": Work("post_train", read_training, prepare_training(folder)),
     }
+
+
+def prepare_training(folder: Path) -> dict[str, str]:
+    """What a video generator is post-trained on and from, written below a folder; nothing without diffusers."""
+    if not all(importlib.util.find_spec(name) for name in ("diffusers", "peft")):
+        return {}
+    from post_training_parts import save_dataset, save_stock
+
+    data = save_dataset(folder / "clips"), save_dataset(folder / "others", scenes=["cellar"])
+    places = {"data": data[0], "validation": data[1], "weights": save_stock(folder / "stock", "ltx-action")}
+    return {name: str(path) for name, path in places.items()}
+
+
+def read_training(target: Path) -> dict[str, Any]:
+    """The files of a training, with its log in place of when each of its lines was written."""
+    found = read_files(target)
+    log = found.pop("ltx.log/metrics.jsonl").decode().splitlines()
+    return {**found, "log": [{**json.loads(line), "seconds": 0} for line in log]}
 
 
 def read_files(target: Path) -> dict[str, bytes]:
@@ -92,9 +113,9 @@ def carry_out(victims: Victims, work: Work, folder: Path, number: int, way: str)
     return victims.run(work.job, **{**place, **options}, below=str(folder), fault=[number, way])
 
 
-WORKS = ("run", "run on a local disk", "resume", "merge", "csv", "parquet", "view", "report", "collect", "train")
-FILES = ("csv", "parquet", "view", "report", "train")
+FILES = ("csv", "parquet", "view", "report", "train", "post-train")
 """Jobs that write files or folders at once."""
+WORKS = ("run", "run on a local disk", "resume", "merge", "collect", *FILES)
 
 
 @pytest.mark.parametrize("name", WORKS)
@@ -115,6 +136,8 @@ def test_each_write_that_fails_harms_nothing(name: str, victims: Victims, works:
 
 
 def check_faults(victims: Victims, work: Work, tmp_path: Path, choose: Callable[[int], Any], first: int = 0) -> None:
+    if work.job == "post_train" and not work.options:
+        pytest.skip("needs wiw[diffusers]")
     quiet = begin(work, tmp_path / "quiet")
     assert carry_out(victims, work, quiet, 0, FAULTS[0]) == 0, victims.said
     expected, writes = work.read(quiet / work.target), int(victims.said)

@@ -23,6 +23,7 @@ pytest.importorskip("diffusers", reason="no diffusers: pip install 'wiw[diffuser
 pytest.importorskip("peft", reason="no peft: pip install 'wiw[diffusers]'")
 
 import torch
+from safetensors import safe_open
 from test_loop_poses import imagine_plans, plan_of
 
 from wiw.world_models.video.actions import checkpoint
@@ -187,6 +188,28 @@ def test_checkpoints_come_back_as_they_went(name: str, made, tmp_path: Path) -> 
     same = pickle.loads(pickle.dumps(model))
     assert same.describe() == model.describe() and same.fingerprint() == model.fingerprint()
     assert model.accepts.view == "panorama" and model.accepts.null_first and model.describe()["checkpoint_digest"]
+
+
+def test_equal_loras_are_equal_bytes(made, tmp_path: Path) -> None:
+    """Also what the file says of them, in whose order the library that writes it follows no rule."""
+    model = made("wan2.1-action")
+    assert model._lora
+    files = []
+    for number in range(8):
+        folder = checkpoint.save(
+            tmp_path / str(number), model.conditioning.encoders, model.generator.pipeline, lora=True
+        )
+        files.append((folder / "pytorch_lora_weights.safetensors").read_bytes())
+    assert len(set(files)) == 1
+    with safe_open(folder / "pytorch_lora_weights.safetensors", "pt") as read:
+        said = json.loads(read.metadata()["lora_adapter_metadata"])
+        assert read.metadata()["format"] == "pt" and len(list(read.keys())) == 2 * said_layers(model)
+    assert said["transformer.target_modules"] == sorted(said["transformer.target_modules"])
+
+
+def said_layers(model) -> int:
+    """Number of layers of the denoiser that the LoRA is on."""
+    return sum(name.endswith("lora_A.actions") for name, _ in model.generator.pipeline.transformer.named_modules())
 
 
 def test_both_experts_and_their_lora_count(made, tmp_path: Path) -> None:

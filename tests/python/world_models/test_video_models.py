@@ -446,6 +446,7 @@ def test_weights_in_the_hubs_cache_need_no_network(hub, made, world_model_option
         "CUDA out of memory. Tried to allocate 2.00 GiB.\nmore",
         "CUDA error: out of memory",
         "CUDA error: CUBLAS_STATUS_ALLOC_FAILED when calling `cublasCreate(handle)`",
+        "DefaultCPUAllocator: can't allocate memory: you tried to allocate 8000000000000 bytes. Error code 12",
     ],
 )
 def test_a_full_gpu_is_answered_with_the_options_that_need_less(said, made):

@@ -16,11 +16,12 @@ import wiw
 from wiw.datasets.navigation import NavigationData, Part
 from wiw.errors import WeightsError
 from wiw.files import atomic_file
+from wiw.networks import memory_guard
 from wiw.training.held_out_clips import Frames, Imagine, imagine_with
 from wiw.training.pocket.recipe import PocketRecipe
 from wiw.training.pocket.trainer import PocketTrainer
 from wiw.training.post_training.clip_trainer import arrange_clips
-from wiw.training.post_training.corpora import NavigationCorpus, require_panoramas
+from wiw.training.post_training.corpora import NavigationCorpus, require_panoramas, require_training_split
 from wiw.training.post_training.stop_signals import SignalledCheckpoint
 from wiw.training.post_training.train import train_and_validate
 from wiw.training.post_training.validation import (
@@ -78,10 +79,11 @@ def train_pocket(
         The card in the file: data, recipe, steps, validation and the loss at the end.
 
     Raises:
-        ArgumentError: a dataset of perspective views, too few clips, a state of a training with other data or numbers,
-            or validation on scenes that are trained on or not there.
+        ArgumentError: a dataset of perspective views or of scenes for evaluation, too few clips, a state of a training
+            with other data or numbers, or validation on scenes that are trained on or not there.
         TrainingError: the loss is not finite; the last good state is kept, the message names the batch.
         FileError: the dataset is missing or damaged, or a file cannot be written.
+        DeviceMemoryError: memory does not suffice.
     """
 
     def open_part(folder: str | Path, wanted: Part) -> NavigationCorpus:
@@ -90,6 +92,7 @@ def train_pocket(
         return found
 
     corpus = open_part(data, part)
+    require_training_split(corpus)
     dataset = corpus.data
     clips = dataset.clips(recipe.frames)
     arrange_clips(len(clips), recipe)
@@ -103,17 +106,18 @@ def train_pocket(
         return finished
     trainer = PocketTrainer(clips, reduce_frames(dataset, recipe.size, cache, bar), recipe)
     state = SignalledCheckpoint(out.with_name(f"{out.name}.checkpoint"), {"model": "pocket", **card}, seconds)
-    validated = train_and_validate(
-        trainer,
-        create_sampler(trainer),
-        checked,
-        out,
-        lambda best, found: _save_best(best, trainer, found),
-        state,
-        tracker,
-        on_step,
-        on_validation,
-    )
+    with memory_guard("training pocket", f"lower batch (now {recipe.batch}) or places (now {recipe.places})"):
+        validated = train_and_validate(
+            trainer,
+            create_sampler(trainer),
+            checked,
+            out,
+            lambda best, found: _save_best(best, trainer, found),
+            state,
+            tracker,
+            on_step,
+            on_validation,
+        )
     card |= {"trained_steps": trainer.step_count, "loss": trainer.mean_loss}
     card = _publish_weights(out, validated, trainer, card)
     state.remove()

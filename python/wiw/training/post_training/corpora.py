@@ -23,6 +23,7 @@ from wiw.datasets.demonstration import Outline, name_demonstration
 from wiw.datasets.demonstrations import Demonstrations, read_manifest
 from wiw.datasets.navigation import META, Clips, NavigationData, Part, part_of
 from wiw.datasets.parquet_files import MANIFEST
+from wiw.datasets.scene_splits import find_named_split
 from wiw.errors import ArgumentError, FileError
 from wiw.training.held_out_clips import HeldOutClips
 from wiw.training.held_out_demonstrations import DemonstratedPlan, select_demonstrations
@@ -72,6 +73,11 @@ class Corpus(ABC):
     def units(self) -> set[str]:
         """Names of the scenes or demonstrations that it has."""
 
+    @property
+    @abstractmethod
+    def camera_height(self) -> float | None:
+        """Metres of its cameras above the floor, where that is the same in all frames and known."""
+
     @abstractmethod
     def clips(self, frames: int) -> CorpusClips:
         """Return all clips with this number of frames.
@@ -118,6 +124,22 @@ def open_corpus(folder: str | Path, part: Part, held_out: float = 0.05) -> Corpu
     return NavigationCorpus(NavigationData(folder, part, held_out), part)
 
 
+def require_training_split(corpus: Corpus) -> None:
+    """Raise ArgumentError where a corpus has scenes of a split for evaluation, on which nothing is trained."""
+    if not isinstance(corpus, NavigationCorpus):
+        return
+    named = {scene: find_named_split(scene) for scene in sorted(corpus.units)}
+    found = next(((scene, split) for scene, split in named.items() if split is not None), None)
+    stated = corpus.data.meta.get("split", "train")
+    if found is None and stated == "train":
+        return
+    what = f"scene {found[0]} of split {found[1]}" if found else f"split {stated}"
+    raise ArgumentError(
+        f"{corpus.data.folder}: expected scenes of a train split, got {what}: a model trained on scenes that it is "
+        "evaluated on proves nothing; collect from a train split, such as apartments:train:80"
+    )
+
+
 def is_demonstrations(folder: Path) -> bool:
     """Return whether a folder is of `wiw collect manipulation`."""
     if (folder / META).exists() or not (folder / MANIFEST).exists():
@@ -160,6 +182,12 @@ class NavigationCorpus(Corpus):
     def units(self) -> set[str]:
         """Names of the scenes."""
         return {row["scene"] for row in self.data.segments}
+
+    @property
+    def camera_height(self) -> float | None:
+        """Metres of the camera above the floor."""
+        height = self.data.meta.get("camera", {}).get("height_m")
+        return None if height is None else float(height)
 
     def cut_views(self, images: NDArray[np.uint8]) -> NDArray[np.uint8]:
         """Return pictures [N, H, W, 3] of the dataset as the corpus shows them."""
@@ -240,6 +268,11 @@ class DemonstrationCorpus(Corpus):
     def units(self) -> set[str]:
         """Names of the demonstrations, by task and seed of the table."""
         return {name_demonstration(outline) for _, outline in self._outlines}
+
+    @property
+    def camera_height(self) -> None:
+        """Not one number: the camera looks down on a table."""
+        return None
 
     def clips(self, frames: int) -> CorpusClips:
         """Return the clips of all plans of at most `frames` - 1 actions; see `Corpus.clips`."""

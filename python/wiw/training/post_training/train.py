@@ -18,7 +18,7 @@ from wiw.files import atomic_file, atomic_folder
 from wiw.training.held_out_clips import Imagine
 from wiw.training.post_training import distributed
 from wiw.training.post_training.clip_trainer import ClipTrainer, arrange_clips
-from wiw.training.post_training.corpora import Corpus, CorpusPart, open_corpus
+from wiw.training.post_training.corpora import Corpus, CorpusPart, open_corpus, require_training_split
 from wiw.training.post_training.families import Family, Loaded, PretrainedWeights, find_family
 from wiw.training.post_training.latent_cache import LatentCache
 from wiw.training.post_training.recipe import ClipRecipe, PostTrainingRecipe, load_recipe
@@ -97,9 +97,9 @@ def post_train(
         What the checkpoint's `training.json` says: model, data, recipe, steps, the loss at the end, how it is run.
 
     Raises:
-        ArgumentError: a model that is not trained here or not on such data, too few clips, a recipe that the model
-            cannot have, a state of a training with other data or numbers, or validation on what is trained on, not
-            there, or of another kind.
+        ArgumentError: a model that is not trained here or not on such data, scenes of a split for evaluation, too few
+            clips, a recipe that the model cannot have, a state of a training with other data or numbers, or validation
+            on what is trained on, not there, or of another kind.
         TrainingError: the loss is not finite; the last good state is kept, the message names the batch.
         FileError: `out` holds something, or the dataset is missing or damaged.
         WeightsError, DependencyError, DeviceMemoryError: see the world model.
@@ -110,6 +110,7 @@ def post_train(
     recipe = recipe or choose_precision(load_recipe(name), device)
     _require_free(out)
     corpus, recipe = family.fit(open_corpus(data, part, recipe.held_out), recipe)
+    require_training_split(corpus)
     arrange_clips(len(corpus.clips(recipe.frames)), recipe)
     held_out = find_held_out(partial(open_part, family, recipe), corpus, validation, decisions, recipe)
     source = PretrainedWeights(None if weights is None else str(weights), revision, variant, device)
@@ -180,8 +181,10 @@ def train_and_validate(
 
     Raises:
         TrainingError: the loss is not finite; the state before is kept.
+        FileError: a clip cannot be read, or something cannot be written; the state before is kept if it can be written,
+            and there is no other process.
         DependencyError: the tracker's package is not installed.
-        ArgumentError, FileError: see `wiw.training.checkpoint.Checkpoint`.
+        ArgumentError: see `wiw.training.checkpoint.Checkpoint`.
     """
     if not state.path.exists() and distributed.is_main():
         shutil.rmtree(locate_log(out), ignore_errors=True)
@@ -216,8 +219,9 @@ def _run_steps(
                 state,
             )
             trainer.validate()
-        except TrainingError:
-            if trainer.step_count:
+        except (TrainingError, FileError) as error:
+            everywhere = isinstance(error, TrainingError) or distributed.count_processes() == 1
+            if trainer.step_count and everywhere and trainer.is_logged:
                 state.save(trainer, recipe.epochs, trainer.step_count)
             raise
         finally:

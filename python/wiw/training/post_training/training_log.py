@@ -25,6 +25,8 @@ class TrainingLog:
     def __init__(self, path: Path, trackers: Sequence[Tracker] = ()) -> None:
         self.path, self._trackers = path, trackers
         self._began = time.monotonic()
+        self.step = 0
+        """Step of the last line."""
 
     def rewind(self, step: int) -> list[dict[str, Any]]:
         """Drop what was written after a step, and return the rest: the training resumes there, and writes it again.
@@ -35,6 +37,7 @@ class TrainingLog:
         kept = [line for line in self.read() if line["step"] <= step]
         with atomic_file(self.path) as draft:
             draft.write_text("".join(f"{json.dumps(line)}\n" for line in kept), encoding="utf-8")
+        self.step = kept[-1]["step"] if kept else 0
         return kept
 
     def read(self) -> list[dict[str, Any]]:
@@ -63,7 +66,10 @@ class TrainingLog:
             with self.path.open("a", encoding="utf-8") as file:
                 file.write(json.dumps(line) + "\n")
         except OSError as error:
-            raise FileError(f"{self.path}: cannot be written ({error.strerror}); make room") from error
+            raise FileError(
+                f"{self.path}: cannot be written ({error.strerror}); expected a writable file and free space: make room"
+            ) from error
+        self.step = step
         for tracker in self._trackers:
             tracker.log(dict(values), step=step)
 

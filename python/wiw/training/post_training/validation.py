@@ -86,7 +86,8 @@ def find_held_out(
         recipe: of the training.
 
     Raises:
-        ArgumentError: another kind of dataset, nothing is held out, something is in both, or decisions for an arm.
+        ArgumentError: another kind of dataset or height of the camera, nothing is held out, something is in both, or
+            decisions for an arm.
         FileError: the dataset is missing or damaged.
     """
     if recipe.validate_every is None or (validation is None and corpus.part != "train"):
@@ -96,6 +97,12 @@ def find_held_out(
         raise ArgumentError(
             f"validation: expected a dataset of `{corpus.command}`, like the training's, but {held_out.data.folder} is "
             f"from `{held_out.command}`"
+        )
+    if held_out.camera_height != corpus.camera_height:
+        raise ArgumentError(
+            f"validation: expected a camera {corpus.camera_height} m above the floor, as in training, but "
+            f"{held_out.data.folder} has one at {held_out.camera_height} m; collect it with --height "
+            f"{corpus.camera_height}"
         )
     if decisions is not None and corpus.space != PRIMITIVES:
         raise ArgumentError("decisions: those of `wiw collect decisions` are for a moving agent; leave them out")
@@ -180,6 +187,11 @@ class ValidatedTrainer(ResumableTrainer):
     def step_count(self) -> int:  # type: ignore[override]
         """Number of steps done."""
         return self.trainer.step_count
+
+    @property
+    def is_logged(self) -> bool:
+        """Whether the log has the last step, so that a state belongs to it; always true where another process logs."""
+        return not distributed.is_main() or self._log.step == self.step_count
 
     def train_step(self, learning_rate: float) -> float:
         """Validate if it is time, then train on one batch and return its loss.

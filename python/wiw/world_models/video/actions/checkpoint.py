@@ -9,6 +9,7 @@ pytorch_lora_weights.safetensors     a LoRA of it (of a second denoiser: pytorch
 
 from __future__ import annotations
 
+import json
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
@@ -71,12 +72,27 @@ def save(
 def _save_lora(folder: Path, place: str, pipeline: Any, denoiser: Any) -> None:
     from peft.utils import get_peft_model_state_dict
 
+    options = denoiser.peft_config[ADAPTER].to_dict()
     pipeline.save_lora_weights(
         folder,
         transformer_lora_layers=get_peft_model_state_dict(denoiser, adapter_name=ADAPTER),
-        transformer_lora_adapter_metadata=denoiser.peft_config[ADAPTER].to_dict(),
+        transformer_lora_adapter_metadata={
+            name: sorted(value) if isinstance(value, set) else value for name, value in options.items()
+        },
         weight_name=name_lora_file(place),
     )
+    _sort_metadata(folder / name_lora_file(place))
+
+
+def _sort_metadata(path: Path) -> None:
+    """Sort a file's metadata by name, so that equal weights are equal bytes: safetensors writes them in any order."""
+    data = path.read_bytes()
+    end = 8 + int.from_bytes(data[:8], "little")
+    header = json.loads(data[8:end])
+    header["__metadata__"] = dict(sorted(header["__metadata__"].items()))
+    text = json.dumps(header, separators=(",", ":"), ensure_ascii=False).encode()
+    text = text.ljust(-(-len(text) // 8) * 8)  # the format aligns what follows
+    path.write_bytes(len(text).to_bytes(8, "little") + text + data[end:])
 
 
 def name_lora_file(place: str) -> str:
