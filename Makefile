@@ -28,8 +28,9 @@ bench:      ## every speed claim, side by side with what a user would pick inste
 	$(BIN)/python tests/benchmark/run_all.py
 
 nightly:    ## what takes too long for every change: the dearest tests, and the small data-scaling study
-	@scripts/setup test
-	$(BIN)/python -m pytest -n $(JOBS) --dist loadfile --no-loadscope-reorder -m nightly
+	@scripts/setup test nightly
+	$(BIN)/python -m pytest -n $(JOBS) --dist loadfile --no-loadscope-reorder -m "nightly or extra"
+	rm -rf build/nightly
 	$(BIN)/wiw study data-scaling --small --workers $(JOBS) --out build/nightly/data-scaling
 
 lint:       ## ruff, mypy, clang-format, clang-tidy

@@ -69,13 +69,21 @@ def atomic_folder(path: Path, replace: Callable[[Path], bool] = lambda folder: F
 def _write_draft(path: Path, draft: Path) -> Iterator[None]:
     try:
         yield
-    except OSError as error:
+    except Exception as error:
+        if not _is_of_system(error):
+            raise
         raise FileError(
-            f"{path}: cannot be written ({error.strerror or error}); expected a writable folder with free space: make "
-            "room or choose another place. No partial file is left"
+            f"{path}: cannot be written ({getattr(error, 'strerror', None) or error}); expected a writable folder with "
+            "free space: make room or choose another place. No partial file is left"
         ) from error
     finally:
         _remove(draft)
+
+
+def _is_of_system(error: Exception) -> bool:
+    """Return whether the system refused to write; safetensors reports that by an error of its own."""
+    own = type(error).__name__ == "SafetensorError" and "I/O error" in str(error)
+    return own or isinstance(error, OSError)
 
 
 def _old(path: Path) -> Path:

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import os
 import signal
+import threading
 import time
 from dataclasses import dataclass
 from pathlib import Path
@@ -113,12 +114,14 @@ class LineTask(Task):
 
 @dataclass
 class LineAgent(BaseAgent):
-    """Goes forward with probability `drive`; `kill` names episodes that kill their process at decision 1."""
+    """Goes forward with probability `drive`; `kill` names episodes that kill or hang their process at decision 1."""
 
     drive: float = 0.7
     kill: tuple[int, ...] = ()
     marker: str = ""
     """File whose absence lets `kill` strike only once."""
+    hangs: bool = False
+    """Whether `kill` hangs the process instead."""
     needs: tuple[str, ...] = ()
     model: Any = None
 
@@ -158,6 +161,8 @@ class LineAgent(BaseAgent):
             if Path(self.marker).exists():
                 return
             Path(self.marker).touch()
+        if self.hangs:
+            threading.Event().wait()
         os.kill(os.getpid(), signal.SIGKILL)
 
 

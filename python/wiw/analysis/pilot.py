@@ -36,14 +36,25 @@ class Pilot:
 
 
 PILOTS = {
-    "imagenav": Pilot(45.7, 3.3, 0.05, 5, "oracle and warp, 210 test episodes: 21 won, 7 lost"),
+    "imagenav": Pilot(45.7, 3.3, 0.05, 5, "oracle and warp, 210 test episodes of version 1: 21 won, 7 lost"),
+    "imagenav-near": Pilot(
+        67.2, 6.8, 0.05, 5, "warp and warpnet, preset foresight, 250 test episodes: 27 won, 17 lost"
+    ),
+    "imagenav-far": Pilot(40.8, 9.2, 0.05, 5, "warp and warpnet, preset foresight, 250 test episodes: 27 won, 23 lost"),
+    "imagenav-beyond": Pilot(
+        46.4, 4.0, 0.05, 5, "oracle and warp, preset foresight, 250 test episodes: 66 won, 10 lost"
+    ),
     "ar": Pilot(84.4, 3.1, 0.05, 5, "warp and none, 225 test episodes: 7 won, 7 lost"),
+    "ar-foresight": Pilot(62.0, 6.4, 0.05, 5, "warpnet and none, 250 test episodes: 26 won, 16 lost"),
     "aeqa": Pilot(
         46.1, 4.0, 0.05, 5, "warpnet and none, 300 test questions: the Score's difference scatters by 36 points"
     ),
     "manipulation": Pilot(74.5, 5.0, 0.0, 1, "armnet and none, 200 tables: 10 lost"),
 }
-"""By task: two arms as `docs/results.md` has them. Correlations within apartments were -0.06 to 0.06."""
+"""By task, and tier or preset: two arms as `docs/results.md` has them.
+
+Correlations within apartments were -0.06 to 0.06.
+"""
 
 
 def find_pilot(task: str) -> Pilot:

@@ -17,8 +17,8 @@ from wiw.analysis.simulate import draw_outcome_counts, sum_by_scene
 from wiw.errors import ArgumentError
 
 BASE, LOSSES, CORRELATION, PER_SCENE = 20.0, 2.0, 0.05, 5
-"""Close to what was measured on 210 test episodes of Image-Goal Navigation in 42 apartments (`docs/results.md`): 18 %
-succeed without a world model; the oracle wins 76 more and loses 4; paired differences correlate within apartments by
+"""Close to what was measured on 210 test episodes of Image-Goal Navigation in 42 apartments (`docs/results.md`): 19 %
+succeed without a world model; the oracle wins 73 more and loses 3; paired differences correlate within apartments by
 -0.06 to 0.06."""
 MOST_SCENES = 100_000
 LEAST = 0.1

@@ -52,15 +52,16 @@ def power(
     --losses matters as much as the difference. Scenes matter more than episodes: with a correlation above 0, more
     episodes in the same scenes soon stop helping.
 
-    Without --task or --pilot, the numbers are close to those measured on 210 episodes in 42 generated apartments: 18 %
-    without a world model; 36 % won and 2 % lost with the oracle; correlations of -0.06 to 0.06 between differences
+    Without --task or --pilot, the numbers are close to those measured on 210 episodes in 42 generated apartments: 19 %
+    without a world model; 35 % won and 1 % lost with the oracle; correlations of -0.06 to 0.06 between differences
     within an apartment.
 
     Args:
         difference: Difference in success rate, in percentage points. If neither it nor --scenes is given, prints a
             table of typical values.
         scenes: Number of scenes, for computing the smallest difference that they can show.
-        task: Take values not given below from two arms of this task in docs/results.md; all: one line per task.
+        task: Take values not given below from two arms of this task in docs/results.md: imagenav, imagenav-near,
+            imagenav-far, imagenav-beyond, ar, ar-foresight, aeqa or manipulation; all: one line per task.
         pilot: Take values not given below from two arms of this run.
         pilot_arms: The two arms of --pilot, as ARM,BASE.
         base: Success rate of the base arm in percent. Default: 20, unless --task or --pilot sets it.

@@ -146,6 +146,8 @@ class ResumeConfig:
     """Episodes that run at the same time in each process, as in `wiw run`. Default: as before."""
     deadline: Annotated[float | None, arg(metavar="SECONDS")] = None
     """Time limit in seconds for a call to the world model. Default: as before."""
+    stall: Annotated[float | None, arg(metavar="SECONDS")] = None
+    """Time in seconds without news after which a worker is stopped as hung, as in `wiw run`. Default: as before."""
     cache: Annotated[str | Path | None, arg(metavar="auto|off|DIR")] = None
     """Where rollouts are cached, as in `wiw run`. Default: as before."""
     cache_gb: Annotated[float | None, arg(metavar="N")] = None

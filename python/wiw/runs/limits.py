@@ -3,6 +3,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, Any
@@ -14,6 +15,8 @@ from wiw.loop.limits import BUDGET_GB, DEADLINE
 
 NO_DEADLINE = 1e12
 """Seconds that stand for no deadline where a number must be stored."""
+CALLS = 24
+"""Deadlines that pass without news before a worker counts as hung: a decision may make many calls."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -27,6 +30,9 @@ class Limits:
     deadline: Annotated[float, arg(metavar="SECONDS")] = DEADLINE
     """Time limit in seconds for a call to the world model. After three attempts the episode is recorded as an
     infrastructure error, which is excluded from scores."""
+    stall: Annotated[float | None, arg(metavar="SECONDS")] = None
+    """Time in seconds without news from a worker process or Ray actor, such as a decision, after which it is stopped as
+    hung, and its episodes begin again. Default: 24 times --deadline, which is 2 hours."""
     cache: Annotated[str | Path, arg(metavar="auto|off|DIR")] = "auto"
     """Where rollouts are cached, so that a model never computes the same one twice: auto (in ~/.cache/wiw/rollouts, for
     models that declare themselves cacheable), a folder (for every model), or off."""
@@ -42,11 +48,18 @@ class Limits:
     missing, the error says which files are needed."""
 
     def __post_init__(self) -> None:
-        for name in ("deadline", "cache_gb"):
-            if not getattr(self, name) > 0:
-                raise ArgumentError(f"expected a {name} above 0, got {getattr(self, name)}")
+        for name in ("deadline", "stall", "cache_gb"):
+            value = getattr(self, name)
+            if value is not None and not value > 0:
+                raise ArgumentError(f"expected a {name} above 0, got {value}")
         if not 0 < self.fidelity_share <= 1:
             raise ArgumentError(f"expected a fidelity_share above 0 and up to 1, got {self.fidelity_share}")
+
+    @property
+    def patience(self) -> float:
+        """Seconds without news after which a worker counts as hung; infinite in one with no deadline for its calls."""
+        patience = CALLS * self.deadline if self.stall is None else self.stall
+        return patience if patience < NO_DEADLINE else math.inf
 
     @property
     def measures_fidelity(self) -> bool:
@@ -57,6 +70,7 @@ class Limits:
         """Return the limits for the run store, independent of the working directory; `Limits(**...)` is the inverse."""
         own = {name: getattr(self, name) for name in Limits.__dataclass_fields__}
         own["deadline"] = min(self.deadline, NO_DEADLINE)
+        own["stall"] = None if self.stall is None else min(self.stall, NO_DEADLINE)
         own["cache"], own["lpips"] = _make_absolute(self.cache), _make_absolute(self.lpips)
         return own
 

@@ -2,9 +2,10 @@
 """Run episodes in Ray actors, on this machine or on a Ray cluster. This process alone writes what they report.
 
 An actor is a worker as in `workers.py`: it builds task and agents from recipes, leases one job at a time and sends its
-rows as they come. Ray tells when an actor, its process or its node is lost; what the job had not finished is then
-leased again, one episode at a time, at most `TRIES` times. So is an episode that a lost server of the run
-(`ray_servers.py`) has cost. No object of Ray's gets into the results.
+rows as they come, which are the lease's heartbeat: an actor without any for too long is hung, and is killed. Ray tells
+when an actor, its process or its node is lost; what the job had not finished is then leased again, one episode at a
+time, at most `TRIES` times. So is an episode that a lost server of the run (`ray_servers.py`) has cost. No object of
+Ray's gets into the results.
 """
 
 from __future__ import annotations
@@ -24,6 +25,7 @@ from wiw.errors import InfrastructureError, RemoteError, VlmError
 from wiw.isolation.source import end_idle_processes
 from wiw.ray_cluster import connect_cluster, import_ray
 from wiw.runs.config import EngineConfig
+from wiw.runs.limits import Limits
 from wiw.runs.ray_servers import START_SECONDS as SERVER_SECONDS
 from wiw.runs.ray_servers import LostServersError, ServerPool
 from wiw.runs.rows import OutcomeRow
@@ -33,7 +35,9 @@ from wiw.runs.workers import (
     ReportReceiver,
     Row,
     Runner,
+    Silence,
     WorkerSpec,
+    choose_tick,
     lease_again,
     make_portable,
     pickle_spec,
@@ -98,6 +102,7 @@ class _Lease:
     rows: Any = None
     """Ray's generator of references to rows; before the first job a reference to the actor's start."""
     unfinished: dict[int, Episode] = field(default_factory=dict)
+    silence: Silence = field(default_factory=Silence)
 
 
 def run_on_ray(
@@ -129,6 +134,7 @@ class _ActorPool:
     ) -> None:
         self._ray, self._spec, self._jobs, self._receiver = ray, spec, jobs, receiver
         self._size, self._config = min(size, len(jobs)), config
+        self._patience = Limits(**spec.limits).patience
         self._leases: list[_Lease] = []
         self._begun = 0
         """Actors so far."""
@@ -168,14 +174,22 @@ class _ActorPool:
         """Wait for rows, starts and losses, and deal with what has come."""
         servers = [*self._models.refs, *self._vlms.refs]
         waiting = [*(lease.rows for lease in self._leases if lease.rows), *servers]
-        serves = self._models.serves and self._vlms.serves
-        ready, _ = self._ray.wait(waiting, timeout=START_SECONDS if serves else SERVER_SECONDS + START_SECONDS)
-        if not ready and not any(lease.job for lease in self._leases):
+        serves, began = self._models.serves and self._vlms.serves, time.monotonic()
+        working = [lease for lease in self._leases if lease.job]
+        most = START_SECONDS if serves else SERVER_SECONDS + START_SECONDS
+        seconds = min(most, choose_tick(self._patience)) if working else most
+        ready, _ = self._ray.wait(waiting, timeout=seconds)
+        if not ready and not working:
             raise InfrastructureError(self._describe_shortage(serves))
         for pool in (self._models, self._vlms):
             pool.update_servers(ready)
+        for lease in working:
+            lease.silence.note(lease.rows in ready, min(time.monotonic() - began, seconds))
         for lease in [lease for lease in self._leases if lease.rows in ready]:
             self._receive(lease)
+        for lease in [lease for lease in working if lease.silence.seconds > self._patience]:
+            self._ray.kill(lease.actor)
+            self._replace(lease, InfrastructureError(lease.silence.describe()))
 
     def _describe_shortage(self, serves: bool) -> str:
         config = self._config

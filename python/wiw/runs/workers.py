@@ -4,14 +4,17 @@
 Workers are spawned, never forked: a forked child hangs in an OpenGL context it did not make. Each asks for one job at a
 time and sends rows back; this process alone writes them. A worker that dies takes no episode with it: what it had not
 finished is run once more, one episode at a time, and only an episode that kills its worker twice is recorded as failed.
+One that sends nothing for long is hung, in code that has no deadline of its own, and is killed.
 """
 
 from __future__ import annotations
 
+import math
 import os
 import pickle
 import signal
 import sys
+import time
 from collections import deque
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
@@ -161,7 +164,7 @@ def run_in_workers(spec: WorkerSpec, jobs: Iterable[Job], receiver: ReportReceiv
         Error: what a worker raised on purpose, such as a broken contract.
     """
     end_idle_processes()
-    pool = _WorkerPool(pickle_spec(spec), deque(jobs), receiver, workers)
+    pool = _WorkerPool(pickle_spec(spec), deque(jobs), receiver, workers, Limits(**spec.limits).patience)
     try:
         pool.run()
     finally:
@@ -184,19 +187,42 @@ def pickle_spec(spec: WorkerSpec) -> bytes:
 
 
 @dataclass
+class Silence:
+    """How long nothing has come from a worker that is at work."""
+
+    seconds: float = 0.0
+
+    def note(self, has_news: bool, waited: float) -> None:
+        """Note how long news was waited for, which is no longer than was intended if the machine slept meanwhile."""
+        self.seconds = 0.0 if has_news else self.seconds + waited
+
+    def describe(self) -> str:
+        """Return why the worker was ended."""
+        return f"no news for {self.seconds:.0f} s, in code without a deadline (--stall)"
+
+
+def choose_tick(patience: float) -> float:
+    """Return for how long to wait for news at a time."""
+    return min(60.0, patience / 4)
+
+
+@dataclass
 class _Worker:
     process: Any
     pipe: Connection
     ready: bool = False
     job: Job | None = None
     unfinished: dict[int, Episode] = field(default_factory=dict)
+    silence: Silence = field(default_factory=Silence)
 
 
 class _WorkerPool:
-    """The parent's side: assigns jobs to workers, receives their rows, and replaces workers that died."""
+    """The parent's side: assigns jobs to workers, receives their rows, and replaces workers that died or hang."""
 
-    def __init__(self, spec: bytes, jobs: deque[Job], receiver: ReportReceiver, size: int) -> None:
-        self._spec, self._jobs, self._receiver = spec, jobs, receiver
+    def __init__(
+        self, spec: bytes, jobs: deque[Job], receiver: ReportReceiver, size: int, patience: float = math.inf
+    ) -> None:
+        self._spec, self._jobs, self._receiver, self._patience = spec, jobs, receiver, patience
         self._size = min(size, len(jobs))
         self._workers: list[_Worker] = []
 
@@ -206,9 +232,23 @@ class _WorkerPool:
                 self._assign(worker)
             while len(self._workers) < self._size and self._jobs:
                 self._workers.append(_start(self._spec, self._size))
-            by_pipe = {worker.pipe: worker for worker in self._workers}
-            for pipe in wait(list(by_pipe)):
-                self._receive(by_pipe[pipe])  # type: ignore[index]
+            self._await_news()
+
+    def _await_news(self) -> None:
+        """Wait for messages, receive them, and kill workers that have sent none for too long."""
+        by_pipe = {worker.pipe: worker for worker in self._workers}
+        began, tick = time.monotonic(), choose_tick(self._patience)
+        ready = wait(list(by_pipe), tick)
+        for worker in [worker for worker in self._workers if not self._hangs(worker)]:
+            idle = worker.ready and worker.job is None
+            worker.silence.note(idle or worker.pipe in ready, min(time.monotonic() - began, tick))
+            if self._hangs(worker):
+                worker.process.kill()  # its pipe then ends
+        for pipe in ready:
+            self._receive(by_pipe[pipe])  # type: ignore[index]
+
+    def _hangs(self, worker: _Worker) -> bool:
+        return worker.silence.seconds > self._patience
 
     def stop(self) -> None:
         for worker in self._workers:
@@ -254,7 +294,7 @@ class _WorkerPool:
         self._workers.remove(worker)
         worker.pipe.close()
         worker.process.join()
-        cause = _describe_exit(worker.process.exitcode)
+        cause = worker.silence.describe() if self._hangs(worker) else _describe_exit(worker.process.exitcode)
         if not worker.ready:
             raise InfrastructureError(
                 f"a worker process could not start ({cause}): the task could not be built there; a script that "

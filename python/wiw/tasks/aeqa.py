@@ -20,7 +20,7 @@ from wiw.datasets.questions.mesh_table import NO_ATTRIBUTES, read_attributes
 from wiw.datasets.visibility import COARSE, measure_sizes
 from wiw.datasets.worlds import World, world
 from wiw.envs.episode_state import EpisodeState
-from wiw.errors import ArgumentError, JudgeError, StoreError, VlmError
+from wiw.errors import ArgumentError, FileError, JudgeError, StoreError, VlmError
 from wiw.judging import Judge, Judgement, make_judge
 from wiw.judging.judge import HIGHEST_MARK
 from wiw.scenes import is_generated, resolve
@@ -166,10 +166,15 @@ class AEQA(NavigationTask):
     # -- episodes ------------------------------------------------------------------------------------------------------
 
     def load_episodes(self) -> list[Episode]:
-        """Return the file's episodes: wiw's own, or one of OpenEQA's lists."""
+        """Return the file's episodes: wiw's own, or one of OpenEQA's lists.
+
+        Raises:
+            FileError: the file cannot be read, an episode has no question or a bad one, or two have the same id.
+        """
         assert self.episode_file is not None
         published = isinstance(read_json(self.episode_file), list)
         found = openeqa.load(self.episode_file, self.scene_folder) if published else super().load_episodes()
+        _check_questions(found, self.episode_file)
         return [_describe(episode) for episode in found]
 
     def episodes(self, count: int) -> list[Episode]:
@@ -333,6 +338,24 @@ class AEQA(NavigationTask):
 def read_question(episode: Episode) -> Question:
     """Return the question of an episode, including everything hidden from the agent."""
     return Question.from_info(episode.info["question"])
+
+
+def _check_questions(episodes: Sequence[Episode], path: str | Path) -> None:
+    """Check that each episode of a file has a question, and an id of its own, by which twins name each other."""
+    first: dict[str, int] = {}
+    for i, episode in enumerate(episodes):
+        where = f"{path}: episode {i} ('{episode.episode_id}')"
+        if "question" not in episode.info:
+            raise FileError(
+                f"{where} has no question: expected a file of `wiw episodes aeqa`, or a list of OpenEQA; episodes of "
+                "other tasks ask none"
+            )
+        try:
+            read_question(episode)
+        except ArgumentError as error:
+            raise FileError(f"{where}: {error}") from error
+        if (other := first.setdefault(episode.episode_id, i)) != i:
+            raise FileError(f"{where} has the id of episode {other}; expected a unique one")
 
 
 def _describe(episode: Episode) -> Episode:

@@ -238,6 +238,7 @@ def test_large_pictures_are_thinned_and_long_episodes_sampled() -> None:
     assert many.frames == 3 and many.describe()["std"] == tally.describe()["std"]
 
 
+@pytest.mark.extra
 def test_datasets_loads_and_streams_it(exported: Path, tmp_path: Path) -> None:
     pytest.importorskip("datasets.arrow_dataset", reason="no datasets: pip install datasets")
     import datasets

@@ -267,6 +267,7 @@ def test_parts_share_no_scene_and_scenes_stay_where_they_are(collected: Path) ->
         NavigationData(collected, "val")  # type: ignore[arg-type]
 
 
+@pytest.mark.extra
 def test_datasets_loads_and_streams_it(collected: Path, tmp_path: Path) -> None:
     pytest.importorskip("datasets.arrow_dataset", reason="no datasets: pip install datasets")
     import datasets

@@ -8,7 +8,9 @@ import locale
 import os
 import pickle
 import random
+import shutil
 import signal
+import subprocess
 import sys
 import threading
 import time
@@ -352,3 +354,60 @@ def test_an_episode_that_ends_its_model_s_process_three_times_is_an_error_and_th
     assert "in 3 attempts; the last error: its process ended with exit code 3" in error["error"]
     assert disturbed == {episode: quiet[episode] for episode in (0, 2)} and there.complete
     assert here.store.config["arms"][0]["agent"]["model_options"] == {"isolate": False}
+
+
+THEIRS = """
+import os, numpy as np, wiw
+
+class Theirs(wiw.WorldModel):
+    accepts = wiw.accepts(control="trajectory", view="perspective", size=(8, 16))
+    version = "1"
+
+    def rollout(self, observations, controls, seeds):
+        frames = np.repeat(observations.image[:, None], len(controls[0].actions) + 1, 1)
+        frames[:, 1:] = os.getpid() % 251
+        return frames
+"""
+"""A model that shows in which process it runs."""
+
+
+def test_the_model_of_an_installed_package_has_a_process_of_its_own(tmp_path, monkeypatch):
+    """Installed packages name models by entry points; these are as foreign as files."""
+    (tmp_path / "theirs.py").write_text(THEIRS)
+    (tmp_path / "theirs-1.0.dist-info").mkdir()
+    (tmp_path / "theirs-1.0.dist-info" / "METADATA").write_text("Metadata-Version: 2.1\nName: theirs\nVersion: 1.0\n")
+    (tmp_path / "theirs-1.0.dist-info" / "entry_points.txt").write_text("[wiw.world_models]\ntheirs = theirs:Theirs\n")
+    monkeypatch.syspath_prepend(tmp_path)
+    image = np.zeros((2, 8, 16, 3), np.uint8)
+    model = wiw.world_model("theirs")
+    assert isinstance(model, IsolatedModel) and "theirs" not in sys.modules
+    frames = model.rollout(Conditioning(image), CONTROLS, np.arange(2, dtype=np.uint64))
+    model.close()
+    assert not frames[:, 0].any() and len(np.unique(frames[:, 1:])) == 1 and frames[0, 1, 0, 0, 0] != os.getpid() % 251
+    here = wiw.world_model("theirs", isolate=False).rollout(
+        Conditioning(image), CONTROLS, np.arange(2, dtype=np.uint64)
+    )
+    assert (here[:, 1:] == os.getpid() % 251).all()
+
+
+def test_a_small_dev_shm_is_enough(tmp_path):
+    """Shared memory is anonymous files; containers often have 64 MB in /dev/shm, here it is 64 kB."""
+    (tmp_path / "theirs.py").write_text(THEIRS.replace("(8, 16)", "(480, 960)"))
+    (tmp_path / "ask.py").write_text(
+        "import os, numpy as np, wiw\nfrom wiw.types import Conditioning, Control\n"
+        "if __name__ == '__main__':\n"
+        "    plan = np.full(14, wiw.action.FORWARD, np.int8)\n"
+        "    control = Control(plan, np.zeros((14, 3)), np.stack([np.eye(4)] * 14), length=14)\n"
+        "    model = wiw.world_model('theirs.py:Theirs')\n"
+        "    image = np.zeros((1, 480, 960, 3), np.uint8)\n"
+        "    frames = model.rollout(Conditioning(image), [control], np.zeros(1, np.uint64))\n"
+        "    model.close()\n"
+        "    print(frames.nbytes, os.statvfs('/dev/shm').f_blocks * os.statvfs('/dev/shm').f_frsize)\n"
+    )
+    small = "mount -t tmpfs -o size=64k tmpfs /dev/shm"
+    if shutil.which("unshare") is None or subprocess.run(["unshare", "-m", "sh", "-c", small], check=False).returncode:
+        pytest.skip("making a small /dev/shm needs root and the right to mount")
+    command = ["unshare", "-m", "sh", "-c", f"{small} && exec {sys.executable} ask.py"]
+    environment = {**os.environ, "PYTHONPATH": os.pathsep.join(sys.path)}
+    said = subprocess.check_output(command, cwd=tmp_path, env=environment, text=True, timeout=120)
+    assert said.split() == [str(15 * 480 * 960 * 3), str(64 << 10)]

@@ -3,7 +3,9 @@
 
 from __future__ import annotations
 
+import math
 import os
+import re
 import signal
 from dataclasses import dataclass
 from pathlib import Path
@@ -16,6 +18,9 @@ from test_crash import facts
 
 import wiw.errors
 from wiw import scenes
+from wiw.errors import ArgumentError
+from wiw.runs.limits import Limits
+from wiw.runs.workers import Silence
 from wiw.studies.evaluate import run_arms
 
 
@@ -56,6 +61,35 @@ def test_a_worker_killed_every_ten_episodes_costs_no_result(tmp_path: Path) -> N
         found.append(facts(tmp_path / name)[:3])
     assert len(list((tmp_path / "markers").iterdir())) == 3
     assert found[0] == found[1]
+
+
+def test_a_worker_that_hangs_is_replaced_and_costs_no_result(tmp_path: Path) -> None:
+    """In code that has no deadline of its own; the others go on meanwhile."""
+    agent = LineAgent(kill=(4,), hangs=True, marker=str(tmp_path / "marker"))
+    found = []
+    for name, own, options in (("quiet", LineAgent(), {}), ("hung", agent, {"workers": 2, "stall": 4.0})):
+        run_arms(LineTask(), {"a": own}, 10, out=tmp_path / name, progress=False, salt="", **options)
+        found.append(facts(tmp_path / name)[:3])
+    assert (tmp_path / "marker").exists() and found[0] == found[1]
+
+
+def test_an_episode_that_hangs_every_worker_is_an_error(tmp_path: Path) -> None:
+    agent = LineAgent(kill=(4,), hangs=True)
+    log = run_arms(LineTask(), {"a": agent}, 6, out=tmp_path / "run", progress=False, workers=2, stall=4.0, live=1)
+    assert len(log.episodes) == 6
+    (error,) = [row for row in log.episodes if row["status"] == "error"]
+    assert (error["episode"], error["kind"]) == (4, "worker")
+    assert re.search(r"died twice on this episode, last: no news for \d+ s, .*--stall", error["error"])
+
+
+def test_silence_is_what_was_waited_for_since_the_last_news() -> None:
+    silence = Silence()
+    for has_news, waited, seconds in ((False, 3, 3), (False, 3, 6), (True, 3, 0), (False, 2, 2)):
+        silence.note(has_news, waited)
+        assert silence.seconds == seconds
+    assert [Limits(**given).patience for given in ({}, {"stall": 9.0}, {"deadline": 1e12})] == [7200, 9, math.inf]
+    with pytest.raises(ArgumentError, match="expected a stall above 0"):
+        Limits(stall=0.0)
 
 
 def test_out_of_descriptors_a_run_ends_with_the_reason_and_goes_on_later(

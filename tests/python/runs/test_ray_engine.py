@@ -57,6 +57,16 @@ def test_a_lost_actor_costs_the_episodes_in_flight_and_nothing_else(ray, referen
     assert list_facts(tmp_path / "run") == reference
 
 
+def test_an_actor_that_hangs_is_replaced_and_costs_no_result(ray, reference, tmp_path):
+    agents = {
+        arm: LineAgent(drive, kill=(6,), hangs=True, marker=str(tmp_path / arm))
+        for arm, drive in (("none", 0.5), ("warp", 0.8))
+    }
+    options = {"progress": False, "engine": "ray", "workers": 2, "live": 2, "stall": 8.0}
+    run_arms(LineTask(), agents, 10, out=tmp_path / "run", **options).close()
+    assert (tmp_path / "none").exists() and list_facts(tmp_path / "run") == reference
+
+
 class ActorInThisProcess:
     """An actor that is lost after the first row of a job of three episodes."""
 
@@ -162,6 +172,7 @@ def test_jobs_are_of_one_scene(ray, tmp_path, monkeypatch):
     assert sum(len(job.episodes) for job in leased) == 20
 
 
+@pytest.mark.extra
 def test_a_driver_that_is_stopped_is_resumed_in_processes(tmp_path):
     pytest.importorskip("ray", reason="needs ray: pip install 'wiw[ray]'")
     out = tmp_path / "run"

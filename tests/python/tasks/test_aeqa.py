@@ -5,6 +5,7 @@ from __future__ import annotations
 
 import json
 import math
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -12,9 +13,10 @@ import pytest
 
 import wiw
 from wiw.action import FORWARD, STOP, TURN_LEFT
+from wiw.datasets.episodes import save
 from wiw.datasets.questions import Question
 from wiw.datasets.worlds import world
-from wiw.errors import ArgumentError, ContractError, JudgeError
+from wiw.errors import ArgumentError, ContractError, FileError, JudgeError
 from wiw.judging import Judge, Judgement
 from wiw.loop.scheduler import run_episodes
 from wiw.policies.base import Policy
@@ -305,6 +307,31 @@ def test_runs_keep_answers_and_judgements_apart_from_numbers(episode, tmp_path):
     assert "blue" in log.report().read_text()
     assert f"<q>{QUESTION.text}</q>" in log.report().read_text()
     json.dumps(make_task(episode).describe())
+
+
+@pytest.mark.parametrize(
+    ("change", "said"),
+    [
+        ({"info": {"radius": 1.0}}, r"episode 1 \('b'\) has no question: expected a file of `wiw episodes aeqa`"),
+        ({"answer": " "}, r"episode 1 \('b'\): .*expected a question and an answer with words in them"),
+        ({"category": "gossip"}, r"episode 1 \('b'\): .*category: expected one of object recognition"),
+        ({"answer": None}, r"episode 1 \('b'\): question: answer: expected text, got None"),
+        ({"episode_id": "a"}, r"episode 1 \('a'\) has the id of episode 0; expected a unique one"),
+    ],
+)
+def test_files_without_proper_questions_are_refused(episode, tmp_path, change, said):
+    path, question = tmp_path / "questions.json", dict(episode.info["question"])
+    save(path, [replace(episode, episode_id=name) for name in ("a", "b")], "aeqa")
+    assert [each.episode_id for each in AEQA(episode_file=path).episodes(2)] == ["a", "b"]
+    body = json.loads(path.read_text())
+    item = body["episodes"][1]
+    if change.keys() <= item.keys():
+        item.update(change)
+    else:
+        item["info"]["question"] = {**question, **change}
+    path.write_text(json.dumps(body))
+    with pytest.raises(FileError, match=said):
+        AEQA(episode_file=path).episodes(2)
 
 
 def test_presets_differ_in_what_the_published_code_does():

@@ -141,6 +141,7 @@ def test_trainings_share_a_cache_unless_latents_differ(data: Path, weights: Any,
     assert [count(0), count(1, rate=1e-2, ema=0.5), count(2, size=(64, 64))] == [1, 1, 2]
 
 
+@pytest.mark.extra
 def test_8_bit_adam_is_near_adam_and_resumes_exactly(data: Path, weights: Any) -> None:
     pytest.importorskip("bitsandbytes", reason="no bitsandbytes: pip install 'wiw[lowbit]'")
     name = "nwm-action"

@@ -203,6 +203,7 @@ def test_trackers_are_told_what_the_log_is(name: str, train: Any, tmp_path: Path
     assert rest == [(line.pop("step"), {k: v for k, v in line.items() if k != "seconds"}) for line in log]
 
 
+@pytest.mark.extra
 def test_tensorboard_is_told_what_the_log_is(tmp_path: Path) -> None:
     pytest.importorskip("tensorboard")
     from tensorboard.backend.event_processing.event_accumulator import EventAccumulator

@@ -3,7 +3,9 @@
 
 from __future__ import annotations
 
+import errno
 import json
+import os
 import time
 from collections.abc import Mapping, Sequence
 from pathlib import Path
@@ -63,8 +65,7 @@ class TrainingLog:
         line = {"step": step, "seconds": round(time.monotonic() - self._began, 3), **values}
         try:
             self.path.parent.mkdir(parents=True, exist_ok=True)
-            with self.path.open("a", encoding="utf-8") as file:
-                file.write(json.dumps(line) + "\n")
+            _append(self.path, f"{json.dumps(line)}\n".encode())
         except OSError as error:
             raise FileError(
                 f"{self.path}: cannot be written ({error.strerror}); expected a writable file and free space: make room"
@@ -77,3 +78,10 @@ class TrainingLog:
         """Tell the trackers that the training has ended."""
         for tracker in self._trackers:
             tracker.finish()
+
+
+def _append(path: Path, line: bytes) -> None:
+    """Add a line without a buffer: one that failed half-way would be written again, after its own first half."""
+    with path.open("ab", buffering=0) as file:
+        if file.write(line) != len(line):
+            raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
