@@ -9,6 +9,7 @@ from scipy.ndimage import gaussian_filter
 from scipy.spatial.transform import Rotation
 
 from wiw import metrics
+from wiw.datasets.questions.question import CATEGORIES
 from wiw.errors import ArgumentError
 
 RNG = np.random.default_rng(7)
@@ -145,10 +146,28 @@ def test_pose_errors_equal_scipy():
     np.testing.assert_allclose(angle, (turns[0].inv() * turns[1]).magnitude(), atol=1e-9)
 
 
+PUBLISHED = {
+    "object recognition": ((16, 6, 0, 2, 1), 16.0),
+    "attribute recognition": ((21, 2, 0, 2, 8), 30.3),
+    "world knowledge": ((10, 9, 2, 4, 3), 33.0),
+    "object localization": ((13, 10, 3, 4, 5), 34.3),
+    "spatial understanding": ((8, 5, 0, 1, 5), 36.8),
+    "object state recognition": ((11, 1, 0, 4, 11), 52.8),
+    "functional reasoning": ((0, 4, 1, 11, 1), 63.2),
+}
+"""Blind answers to OpenEQA's list of 184: how many have each mark, 1 to 5, and the mean on the paper's scale."""
+
+
+@pytest.mark.parametrize("category", CATEGORIES)
+def test_answer_scores_of_published_marks_by_category(category: str) -> None:
+    counts, mean = PUBLISHED[category]
+    assert metrics.aeqa_score(np.repeat(np.arange(1, 6), counts)) == pytest.approx(mean, abs=0.05)
+
+
 def test_answer_scores_of_published_marks() -> None:
-    counts = {1: 79, 2: 37, 3: 6, 4: 28, 5: 34}  # of the published blind answers to 184 questions
-    marks = [mark for mark, count in counts.items() for _ in range(count)]
-    assert metrics.aeqa_score(marks) == pytest.approx(36.549, abs=5e-4)
+    counts = np.sum([own for own, _ in PUBLISHED.values()], axis=0)
+    assert counts.tolist() == [79, 37, 6, 28, 34]
+    assert metrics.aeqa_score(np.repeat(np.arange(1, 6), counts)) == pytest.approx(36.549, abs=5e-4)
     assert metrics.aeqa_score([0, 1, 6]) == pytest.approx(100 / 3)  # clipped to 1 and 5
 
 

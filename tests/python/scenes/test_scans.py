@@ -551,14 +551,14 @@ def test_targets_of_published_episodes_are_objects_of_the_scan(tmp_path: Path, i
 
 def test_published_questions_and_object_goals_run_on_a_scan(tmp_path: Path, in_process: None) -> None:
     pytest.importorskip("opengl_basisu", reason="needs opengl_basisu: pip install 'wiw[hm3d]'")
-    path = files.write_hm3d(tmp_path)
+    path = files.write_hm3d(tmp_path, "00003-c5eTyR3Rxyh", split="train")
     start = [4.6, 0.0, -3.2]
-    question = {
-        "question": "What is beside the bed?",
-        "answer": "A table",
-        "category": "spatial understanding",
-        "question_id": "q1",
-        "episode_history": "hm3d-v0/000-hm3d-TEEsavR23oF",
+    question = {  # one of OpenEQA's
+        "question": "What is the object to the left of the bed?",
+        "answer": "A radiator",
+        "category": "object recognition",
+        "question_id": "23fb241e-989a-4299-a3fb-8d41f7156397",
+        "episode_history": "hm3d-v0/003-hm3d-c5eTyR3Rxyh",
     }
     (tmp_path / "open-eqa.json").write_text(json.dumps([question]))
     view = {"agent_state": {"position": [5.6, 0.0, -3.0], "rotation": [0.0, 0.0, 0.0, 1.0]}, "iou": 0.5}

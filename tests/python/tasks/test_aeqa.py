@@ -10,6 +10,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from run_facts import list_facts
 
 import wiw
 from wiw.action import FORWARD, STOP, TURN_LEFT
@@ -20,6 +21,8 @@ from wiw.errors import ArgumentError, ContractError, FileError, JudgeError
 from wiw.judging import Judge, Judgement
 from wiw.loop.scheduler import run_episodes
 from wiw.policies.base import Policy
+from wiw.runs.recipes import AgentRecipe, TaskRecipe
+from wiw.studies.run_log import load_run
 from wiw.tasks.aeqa import AEQA
 from wiw.types import Answer, Episode, EpisodeResult, Goal, Proposal, TextAnswer
 
@@ -332,6 +335,19 @@ def test_files_without_proper_questions_are_refused(episode, tmp_path, change, s
     path.write_text(json.dumps(body))
     with pytest.raises(FileError, match=said):
         AEQA(episode_file=path).episodes(2)
+
+
+def test_one_and_two_workers_find_out_the_same(episode, tmp_path):
+    """The default agent: what it perceives, decides and answers, and the pictures of what it believes."""
+    pytest.importorskip("torch", reason="needs wiw[torch]")
+    path = tmp_path / "questions.json"
+    save(path, [replace(episode, episode_id=name) for name in ("a", "b")], "aeqa")
+    task, agent = TaskRecipe("aeqa", {"episode_file": str(path), "actions": 24}), AgentRecipe("explorer", "warp")
+    for workers in (1, 2):
+        out = tmp_path / str(workers)
+        wiw.evaluate(task, agent, 2, out=out, workers=workers, keep_images="all", progress=False).close()
+    assert list_facts(tmp_path / "1") == list_facts(tmp_path / "2")
+    assert len(load_run(tmp_path / "1").episodes) == 2
 
 
 def test_presets_differ_in_what_the_published_code_does():

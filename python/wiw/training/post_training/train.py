@@ -269,7 +269,8 @@ def _publish_best(out: Path, trainer: ValidatedTrainer, card: Mapping[str, Any])
         trainer.best.rename(out)
     except OSError as error:
         raise FileError(
-            f"{out}: cannot be written ({error.strerror}); the best weights are in {trainer.best}"
+            f"{out}: cannot be written ({error.strerror}); expected a writable folder: make room, then repeat the "
+            f"command. The best weights are in {trainer.best}"
         ) from error
     return found
 
