@@ -8,6 +8,7 @@ from hashlib import blake2b
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, TypeVar
 
+from wiw.errors import ArgumentError
 from wiw.world_models import devices
 from wiw.world_models.base import Requirements, WorldModel
 
@@ -15,6 +16,19 @@ if TYPE_CHECKING:
     from torch import nn
 
 T = TypeVar("T", bound="Trained")
+
+
+def require_size(name: str, size: tuple[int, int], smallest: tuple[int, int]) -> None:
+    """Check the (height, width) that a model is to draw in, where its network computes in a smaller one.
+
+    Raises:
+        ArgumentError: it is smaller than that of the network.
+    """
+    if len(size) != 2 or any(given < least for given, least in zip(size, smallest, strict=True)):
+        raise ArgumentError(
+            f"{name}: expected a size (height, width) of at least {tuple(smallest)}, in which the network computes, "
+            f"got {tuple(size)}"
+        )
 
 
 class Trained(WorldModel):

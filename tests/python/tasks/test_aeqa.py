@@ -5,6 +5,7 @@ from __future__ import annotations
 
 import json
 import math
+import pickle
 from dataclasses import replace
 from typing import Any
 
@@ -21,6 +22,7 @@ from wiw.errors import ArgumentError, ContractError, FileError, JudgeError
 from wiw.judging import Judge, Judgement
 from wiw.loop.scheduler import run_episodes
 from wiw.policies.base import Policy
+from wiw.policies.explorer.policy import Explorer
 from wiw.runs.recipes import AgentRecipe, TaskRecipe
 from wiw.studies.run_log import load_run
 from wiw.tasks.aeqa import AEQA
@@ -180,11 +182,39 @@ def test_stopping_ends_without_an_answer_and_an_answer_ends_what_is_stepped(epis
 # -- what policies are given and must return ---------------------------------------------------------------------------
 
 
-def test_the_goal_is_the_text_alone(episode):
-    """A canary: no hidden field of a question reaches a policy."""
-    canary = "XYZZY"
-    question = {**QUESTION.to_info(), "answer": canary, "extra_answers": [canary], "slots": {"object": canary}}
-    marked = Episode("0", SCENE, episode.start_position, 0.0, episode.goal_position, 0.0, 2.0, {"question": question})
+CANARY, NUMBER = "XYZZY", 7654321
+"""In every field that an agent is not to see, as text and as numbers."""
+
+
+@pytest.fixture
+def marked(episode) -> Episode:
+    """An episode whose question, and whatever else is known of it, carries the canary."""
+    question = Question(
+        text=QUESTION.text,
+        answer=CANARY,
+        category=QUESTION.category,
+        answer_type="text",
+        extra_answers=(CANARY,),
+        template=CANARY,
+        slots={"object": CANARY},
+        target=(NUMBER,),
+        viewpoints=((float(NUMBER), 0.0, 0.0, 0.0),),
+        twin=CANARY,
+    )
+    info = {"question": question.to_info(), "task": question.category, "note": CANARY}
+    start, goal = episode.start_position, episode.goal_position
+    return Episode(CANARY, SCENE, start, 0.0, goal, 0.0, float(NUMBER), info)
+
+
+def knows(thing: Any) -> bool:
+    """Whether the canary is anywhere in a thing, however deep: arrays, texts, private parts."""
+    held = pickle.dumps(thing)
+    numbers = (np.array(NUMBER, kind).tobytes() for kind in (np.int32, np.float32, np.float64))
+    return CANARY.encode() in held or any(number in held for number in numbers)
+
+
+def test_the_goal_is_the_text_alone(marked):
+    """No hidden field of a question reaches a policy."""
     seen: list[Any] = []
 
     class Spy(Talker):
@@ -192,9 +222,30 @@ def test_the_goal_is_the_text_alone(episode):
             seen.extend(situations)
             return super().propose(situations, candidates, horizon)
 
+    assert (
+        knows(marked)
+        and knows(np.array([NUMBER, 1.0]))
+        and knows({"deep": [Question.from_info(marked.info["question"])]})
+    )
     run(make_task(marked, actions=30), Spy(final()), [marked])
     assert seen and all(each.goal == Goal("aeqa", text=QUESTION.text, question=True) for each in seen)
-    assert not any(canary in repr((each.goal, each.key, each.memory, vars(each.observation))) for each in seen)
+    assert not any(knows((each.goal, each.key, each.memory, each.executed)) for each in seen)
+    assert not any(CANARY in repr(vars(each.observation)) for each in seen)
+
+
+def test_the_explorer_remembers_nothing_hidden(marked):
+    """The default agent's memory after it has looked around: its map, its beliefs, and what it looks for."""
+    pytest.importorskip("torch", reason="needs wiw[torch]")
+    memories: list[Any] = []
+
+    class Spy(Explorer):
+        def answer(self, situations, proposals, rollouts):
+            memories.extend(situation.memory for situation in situations)
+            return super().answer(situations, proposals, rollouts)
+
+    run(make_task(marked, actions=12), Spy(), [marked])
+    assert memories and not any(knows(memory) for memory in memories)
+    assert b"sofa" in pickle.dumps(memories[-1]), "what the text asks for is found in it by the same means"
 
 
 class Talker(Policy):

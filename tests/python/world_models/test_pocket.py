@@ -10,6 +10,7 @@ import sys
 from pathlib import Path
 from typing import Any
 
+import cv2
 import numpy as np
 import pytest
 
@@ -23,6 +24,7 @@ from wiw.world_models.pocket.model import Pocket, find_places  # noqa: E402
 from wiw.world_models.pocket.network import RADII, Denoiser, Estimate, Views, map_displacements  # noqa: E402
 from wiw.world_models.pocket.sampler import draw_noise, sample_views  # noqa: E402
 from wiw.world_models.pocket.weights import load, save  # noqa: E402
+from wiw.world_models.warpnet.model import shrink_panorama  # noqa: E402
 from wiw.world_models.warpnet.network import plain_room, warp  # noqa: E402
 
 pytestmark = pytest.mark.usefixtures("one_torch_thread")
@@ -224,3 +226,25 @@ def test_a_saved_network_is_loaded_again_and_anything_else_refused(tmp_path: Pat
 def test_torch_is_not_loaded_before_it_is_needed() -> None:
     code = "import sys, wiw.world_models.pocket.model; assert 'torch' not in sys.modules"
     subprocess.run([sys.executable, "-c", code], check=True)
+
+
+# -- size --------------------------------------------------------------------------------------------------------------
+
+
+def test_a_smaller_size_shows_the_same_and_is_part_of_its_identity() -> None:
+    usual, small = Pocket(), Pocket(size=(144, 256))
+    assert (usual.accepts.size, small.accepts.size) == ((576, 1024), (144, 256))
+    assert "size" not in usual.describe()
+    assert small.describe() == usual.describe() | {"size": [144, 256]}
+    large = cv2.resize(np.random.default_rng(0).integers(0, 256, (9, 16, 3), np.uint8), (1024, 576))[None]
+    plan = [control([FORWARD, TURN_LEFT])]
+    expected = rollout(usual, large, plan)[0, 1:]
+    found = rollout(small, shrink_panorama(large[0], (144, 256))[None], plan)[0, 1:]
+    shrunk = np.stack([shrink_panorama(frame, (144, 256)) for frame in expected])
+    assert np.abs(found.astype(int) - shrunk).mean() < 3
+
+
+@pytest.mark.parametrize("size", [(16, 32), (144,), (100, 100)])
+def test_a_size_below_the_networks_is_refused(size: Any) -> None:
+    with pytest.raises(ArgumentError, match=r"pocket: expected a size \(height, width\) of at least"):
+        Pocket(size=size)

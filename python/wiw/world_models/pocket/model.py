@@ -13,8 +13,8 @@ from numpy.typing import NDArray
 from wiw.errors import ArgumentError
 from wiw.networks import single_thread
 from wiw.types import Conditioning, Control
-from wiw.world_models.base import accepts
-from wiw.world_models.trained import Trained
+from wiw.world_models.base import Accepts, accepts
+from wiw.world_models.trained import Trained, require_size
 from wiw.world_models.warpnet.model import STILL, shrink_panorama, to_network, turn_panorama
 
 if TYPE_CHECKING:
@@ -25,6 +25,10 @@ if TYPE_CHECKING:
 BUILT_IN = Path(__file__).with_name("weights.safetensors")
 STEPS = 1
 """Steps of the sampler, unless the user says otherwise."""
+
+
+def _accepts(size: tuple[int, int] | None = None) -> Accepts:
+    return accepts(control="trajectory", view="panorama", size=size, best_batch=16, cacheable=True)
 
 
 class Pocket(Trained):
@@ -38,21 +42,29 @@ class Pocket(Trained):
         weights: a file of `wiw train pocket`; None means those shipped with wiw.
         steps: of the sampler: 1 gives the mean of what may be seen, more draw one
             of them, with blotches where it is uncertain.
+        size: (height, width) of panoramas in and out; 576x1024 if not given. 144x256 is all that the matcher reads.
+            Results differ a little between sizes.
 
     Raises:
         DependencyError: torch or safetensors is not installed.
         WeightsError: no such file, damaged, or of another version.
-        ArgumentError: fewer than one step.
+        ArgumentError: fewer than one step, or the size is too small.
     """
 
     steps = STEPS
-    accepts = accepts(control="trajectory", view="panorama", best_batch=16, cacheable=True)
+    accepts = _accepts()
+    size: tuple[int, int] | None = None
 
-    def __init__(self, weights: str | Path | None = None, steps: int = STEPS) -> None:
+    def __init__(
+        self, weights: str | Path | None = None, steps: int = STEPS, size: tuple[int, int] | None = None
+    ) -> None:
         if steps < 1:
             raise ArgumentError(f"pocket: expected 1 step of the sampler or more, got {steps}")
         super().__init__(weights)
         self.steps = steps
+        if size is not None:
+            require_size("pocket", size, self._network.size)
+            self.size, self.accepts = size, _accepts(size)
 
     @staticmethod
     def _load(weights: str | Path | None) -> tuple[Denoiser, dict[str, Any]]:
@@ -61,8 +73,8 @@ class Pocket(Trained):
         return load(weights or BUILT_IN)
 
     def describe(self) -> dict[str, Any]:
-        """Return the weights' file, a digest of them, steps, and torch's version."""
-        return {**super().describe(), "steps": self.steps}
+        """Return the weights' file, a digest of them, steps, torch's version, and the size if one was chosen."""
+        return {**super().describe(), "steps": self.steps} | ({} if self.size is None else {"size": list(self.size)})
 
     def rollout(
         self, observations: Conditioning, controls: Sequence[Control], seeds: NDArray[np.uint64]

@@ -11,11 +11,10 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from wiw.errors import ArgumentError
 from wiw.networks import single_thread
 from wiw.types import Conditioning, Control
 from wiw.world_models.base import Accepts, accepts
-from wiw.world_models.trained import Trained
+from wiw.world_models.trained import Trained, require_size
 
 if TYPE_CHECKING:
     from wiw.world_models.warpnet.network import Network
@@ -55,12 +54,7 @@ class WarpNet(Trained):
     def __init__(self, weights: str | Path | None = None, size: tuple[int, int] | None = None) -> None:
         super().__init__(weights)
         if size is not None:
-            smallest = self._network.size
-            if len(size) != 2 or any(given < least for given, least in zip(size, smallest, strict=True)):
-                raise ArgumentError(
-                    f"warpnet: expected a size (height, width) of at least {smallest}, in which the network computes, "
-                    f"got {tuple(size)}"
-                )
+            require_size("warpnet", size, self._network.size)
             self.size, self.accepts = size, _accepts(size)
 
     def describe(self) -> dict[str, Any]:
