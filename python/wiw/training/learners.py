@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Small world models that learn from clips of a navigation dataset within minutes, for studies of data."""
+"""Small world models that learn from clips of a navigation dataset: for `wiw train`, and for studies of data."""
 
 from __future__ import annotations
 
@@ -28,7 +28,11 @@ class Learner:
     """The world model that reads the weights by `weights=FILE`."""
     trainer: type[PlaceTrainer]
     create_recipe: Callable[..., ClipRecipe]
-    """Returns a recipe, given `frames`, `size`, `batch`, `clips` and `seed`."""
+    """Returns the recipe of a study, given `frames`, `size`, `batch`, `clips` and `seed`."""
+    recipe: type[ClipRecipe]
+    """Class of its recipes; the shipped one is `wiw/configs/post-training/NAME.yaml`."""
+    load: Callable[[Path], tuple[Any, dict[str, Any]]]
+    """Reads a file of weights into a network and its card."""
     save: Callable[[Path, Any, Mapping[str, Any]], None]
     """Writes a file of weights, given a path, a network and a card."""
 
@@ -46,13 +50,14 @@ def make_learner(name: str) -> Learner:
     devices.require(model.requires)
     if name == "warpnet":
         from wiw.training.warpnet_clips import WarpNetClipRecipe, WarpNetClipTrainer
-        from wiw.world_models.warpnet.weights import save
+        from wiw.world_models.warpnet import weights as warpnet
 
-        return Learner(model, WarpNetClipTrainer, WarpNetClipRecipe, save)
+        return Learner(model, WarpNetClipTrainer, WarpNetClipRecipe, WarpNetClipRecipe, warpnet.load, warpnet.save)
+    from wiw.training.pocket.recipe import PocketRecipe
     from wiw.training.pocket.trainer import PocketTrainer
-    from wiw.world_models.pocket.weights import save as save_pocket
+    from wiw.world_models.pocket import weights as pocket
 
-    return Learner(model, PocketTrainer, _create_pocket_recipe, save_pocket)
+    return Learner(model, PocketTrainer, _create_pocket_recipe, PocketRecipe, pocket.load, pocket.save)
 
 
 def _create_pocket_recipe(**numbers: Any) -> ClipRecipe:

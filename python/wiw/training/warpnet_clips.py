@@ -15,6 +15,8 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
+from wiw.datasets.navigation import Clips, SelectedClips
+from wiw.errors import ArgumentError
 from wiw.networks import has_bfloat16
 from wiw.training.held_out_panoramas import turn_panoramas
 from wiw.training.place_trainer import PlaceTrainer
@@ -47,10 +49,19 @@ class WarpNetClipRecipe(ClipRecipe):
 
 
 class WarpNetClipTrainer(PlaceTrainer):
-    """Train warpnet from random weights, on frames with distances."""
+    """Train warpnet from random weights, on frames with distances.
+
+    Raises:
+        ArgumentError: there are none, or see `PlaceTrainer`.
+    """
 
     recipe: WarpNetClipRecipe
     network: Network
+
+    def __init__(self, clips: Clips | SelectedClips, frames: ReducedFrames, recipe: ClipRecipe) -> None:
+        if not frames.log_distances.size:
+            raise ArgumentError("warpnet learns distances, but the dataset has no depth: collect it with --depth")
+        super().__init__(clips, frames, recipe)
 
     def create_network(self) -> Network:
         """Return a network of random weights."""

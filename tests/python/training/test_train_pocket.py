@@ -21,15 +21,16 @@ torch = pytest.importorskip("torch", reason="needs wiw[torch]")
 
 from wiw.training.held_out_clips import imagine_with  # noqa: E402
 from wiw.training.held_out_panoramas import select_panoramas  # noqa: E402
+from wiw.training.learners import make_learner  # noqa: E402
 from wiw.training.pocket.batches import compute_displacements, draw_batch, draw_places  # noqa: E402
 from wiw.training.pocket.held_out import BASELINES, draw_windows, measure, shuffle_places  # noqa: E402
 from wiw.training.pocket.recipe import PocketRecipe  # noqa: E402
-from wiw.training.pocket.train import create_sampler, train_pocket  # noqa: E402
 from wiw.training.pocket.trainer import PocketTrainer, average_sphere  # noqa: E402
 from wiw.training.post_training.corpora import NavigationCorpus  # noqa: E402
 from wiw.training.post_training.recipe import load_recipe  # noqa: E402
 from wiw.training.post_training.validation import ValidationSet  # noqa: E402
 from wiw.training.reduced_frames import ReducedFrames, reduce_frames  # noqa: E402
+from wiw.training.train_on_clips import create_sampler, train_on_clips  # noqa: E402
 from wiw.types import Conditioning  # noqa: E402
 from wiw.world_models.pocket.model import Pocket  # noqa: E402
 from wiw.world_models.pocket.weights import load  # noqa: E402
@@ -266,13 +267,13 @@ def test_validation_keeps_the_best_weights_and_changes_no_training(
     clips = select_panoramas(NavigationData(dataset).clips(8), 3, 0, SIZE)
     checked = ValidationSet(clips, None, 1, {"made": "of what is trained on, for the test"})
     monkeypatch.setattr(
-        "wiw.training.pocket.train.find_held_out", lambda *_: NavigationCorpus(NavigationData(dataset), "all")
+        "wiw.training.train_on_clips.find_held_out", lambda *_: NavigationCorpus(NavigationData(dataset), "all")
     )
-    monkeypatch.setattr("wiw.training.pocket.train.build_validation_set", lambda *_: checked)
+    monkeypatch.setattr("wiw.training.train_on_clips.build_validation_set", lambda *_: checked)
     told: dict[int, float] = {}
     options = {"on_validation": lambda step, found: told.update({step: found["psnr"]})}
     out = tmp_path / "pocket.safetensors"
-    card = train_pocket(dataset, out, tmp_path, recipe(epochs=3), "all", **options)
+    card = train_on_clips("pocket", dataset, out, tmp_path, recipe(epochs=3), "all", **options)
     assert list(told) == [0, 1, 2, 3] and card["trained_steps"] == 3
     assert card["steps"] == max((1, 2, 3), key=told.__getitem__)
     assert card["validation"]["psnr"] == told[card["steps"]] and load(out)[1] == card
@@ -282,15 +283,15 @@ def test_validation_keeps_the_best_weights_and_changes_no_training(
     assert [line["step"] for line in log if "loss" in line] == [1, 2, 3]
     assert (tmp_path / "pocket.safetensors.log" / "step-0000003.png").exists()
 
-    monkeypatch.setattr("wiw.training.pocket.train.find_held_out", lambda *_: None)
-    plain = train_pocket(dataset, tmp_path / "plain.safetensors", tmp_path, recipe(epochs=3), "all")
+    monkeypatch.setattr("wiw.training.train_on_clips.find_held_out", lambda *_: None)
+    plain = train_on_clips("pocket", dataset, tmp_path / "plain.safetensors", tmp_path, recipe(epochs=3), "all")
     assert plain["loss"] == card["loss"] and plain["steps"] == 3 and "validation" not in plain
 
 
 def test_what_is_validated_are_the_averaged_weights_and_they_are_put_back(dataset: Path, tmp_path: Path) -> None:
     learner = trainer(dataset, tmp_path, ema=0.5)
     learner.train_step(1e-2)
-    imagine = create_sampler(learner)
+    imagine = create_sampler(make_learner("pocket"), learner)
     before = {name: value.clone() for name, value in learner.trained.items()}
     image = np.random.default_rng(0).integers(0, 255, (1, *SIZE, 3)).astype(np.uint8)
     asked = Conditioning(image), np.ones((1, 7), np.int8), np.zeros(1, np.uint64), np.array([[7]])

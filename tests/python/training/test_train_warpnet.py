@@ -3,20 +3,28 @@
 
 from __future__ import annotations
 
+import shutil
 from functools import partial
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
+import yaml
 
 from wiw.cli.app import main
+from wiw.datasets.navigation import read_meta
 from wiw.datasets.worlds import world
-from wiw.errors import ArgumentError
+from wiw.errors import ArgumentError, FileError
+from wiw.training.collect_navigation import collect_navigation
 
 torch = pytest.importorskip("torch", reason="needs wiw[torch]")
 
+from wiw.training.post_training.recipe import load_recipe  # noqa: E402
+from wiw.training.train_on_clips import train_on_clips  # noqa: E402
 from wiw.training.walks import WalkRules, Walks, find_straight_paths, merge_walks, record_walks  # noqa: E402
 from wiw.training.warpnet import Recipe, evaluate, sample_pairs, train  # noqa: E402
+from wiw.training.warpnet_clips import WarpNetClipRecipe, WarpNetClipTrainer  # noqa: E402
 from wiw.world_models.warpnet.model import WarpNet  # noqa: E402
 from wiw.world_models.warpnet.network import Network, warp  # noqa: E402
 
@@ -114,3 +122,79 @@ def test_scenes_without_room_ahead_are_told(two_rooms: str, monkeypatch: pytest.
     model = WarpNet.of(Network(8, (4, 4, 4)))
     with pytest.raises(ArgumentError, match=r"nowhere is 1\.6 m of free floor ahead"):
         evaluate(model, two_rooms, 0)
+
+
+# -- on a dataset ------------------------------------------------------------------------------------------------------
+
+SMALL = ("size=[24,48]", "widths=[4,4,4]", "frames=8", "clips=8", "precision=float32")
+
+
+@pytest.fixture(scope="module", params=[True, False], ids=["depth", "no depth"])
+def dataset(request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFactory, two_rooms: str) -> Path:
+    rules = {"min_samples": 60, "spacing": 1.5, "leaf_ratio": 0.5}
+    folder, options = tmp_path_factory.mktemp("navigation"), {"size": (64, 128), "seed": 3, "backend": "cpu"}
+    collect_navigation(folder, two_rooms, rules=rules, depth=request.param, **options)
+    return folder
+
+
+def test_it_trains_on_a_dataset_and_resumes(
+    dataset: Path, tmp_path: Path, two_rooms: str, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    val = shutil.copy(two_rooms, tmp_path / "another.obj")
+    monkeypatch.setattr("wiw.training.warpnet.evaluate", partial(evaluate, paths=1))
+
+    def run(out: Path) -> int:
+        command = ["train", "warpnet", "--data", str(dataset), "--part", "all", "--val", str(val), "--out", str(out)]
+        command += ["--cache", str(tmp_path / "cache"), "--epochs", "4"]
+        return main([*command, *(each for number in SMALL for each in ("--option", number))])
+
+    if read_meta(dataset)["depth"] is None:
+        assert run(tmp_path / "blind") == 2
+        assert "warpnet learns distances, but the dataset has no depth" in " ".join(capsys.readouterr().err.split())
+        return
+    assert run(tmp_path / "whole") == 0
+    assert "8 steps of 4 clips" in capsys.readouterr().out
+    with monkeypatch.context() as patch, pytest.raises(FileError, match="damaged"):
+        patch.setattr(WarpNetClipTrainer, "compute_losses", fail_at(5))
+        train_on_clips("warpnet", dataset, tmp_path / "parts", tmp_path / "cache", clip_recipe(), "all")
+    assert torch.load(tmp_path / "parts.checkpoint", weights_only=True)["step"] == 5
+    assert run(tmp_path / "parts") == 0
+    whole, parts = WarpNet(tmp_path / "whole"), WarpNet(tmp_path / "parts")
+    assert whole.describe()["digest"] == parts.describe()["digest"]
+    assert whole.card["steps"] == 8 and set(whole.card["held_out"]["psnr"]) == {"copy", "warpnet", "warp"}
+
+
+def clip_recipe() -> WarpNetClipRecipe:
+    options = dict(each.split("=") for each in SMALL)
+    return load_recipe(
+        "warpnet", options={**{k: yaml.safe_load(v) for k, v in options.items()}, "epochs": 4}, kind=WarpNetClipRecipe
+    )
+
+
+def fail_at(step: int) -> Any:
+    stock = WarpNetClipTrainer.compute_losses
+
+    def compute_losses(self: WarpNetClipTrainer, *given: Any) -> Any:
+        if self.step_count == step:
+            raise FileError("frames.parquet: damaged")
+        return stock(self, *given)
+
+    return compute_losses
+
+
+@pytest.mark.parametrize(
+    ("options", "said"),
+    [
+        (["--option", "clips=4"], "--option has no effect on a training on walks; they go with --data"),
+        (["--validation", "other"], "--validation has no effect on a training on walks"),
+        (["--data", "d", "--places", "3"], "--places has no effect on a training on --data"),
+        (["--data", "d", "--minutes", "3"], "--minutes has no effect on a training on --data"),
+        (["--data", "d", "--scenes", "apartments:train:2"], "--scenes has no effect on a training on --data"),
+        (["--data", "nowhere"], "nowhere"),
+    ],
+)
+def test_options_of_the_other_source_are_refused(
+    options: list[str], said: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert main(["train", "warpnet", "--out", str(tmp_path / "w"), *options]) == 2
+    assert said in " ".join(capsys.readouterr().err.split())

@@ -11,14 +11,12 @@ from tyro.conf import arg
 
 from wiw.cli.options import Options
 from wiw.cli.train.corpus import TrackerName, describe_steps, require_data
-from wiw.cli.train.progress import TrainingProgress, track_items
+from wiw.cli.train.on_clips import train_and_measure
 from wiw.cli.train.small_networks import VAL_SCENES, Count, check_counts, check_seed, drop_none, write_weights
-from wiw.errors import ArgumentError
 from wiw.training.preparation import Preparation
 
 if TYPE_CHECKING:
-    from wiw.datasets.navigation import NavigationData
-    from wiw.training.pocket.recipe import PocketRecipe
+    pass
 
 
 def train_pocket(
@@ -68,6 +66,7 @@ def train_pocket(
         cache: Folder for prepared training data, which can be deleted at any time. Default: $WIW_CACHE/looks.
     """
     from wiw.runs.part_options import parse_options
+    from wiw.training.pocket import held_out
     from wiw.training.pocket.recipe import PocketRecipe
     from wiw.training.post_training.recipe import load_recipe
     from wiw.world_models.devices import require
@@ -81,48 +80,13 @@ def train_pocket(
         options = {**numbers, **parse_options(option, PocketRecipe, "--option")}
         chosen = load_recipe("pocket", recipe, options, kind=PocketRecipe)
         watched = {"part": part, "validation": validation, "decisions": decisions, "tracker": tracker}
-        _train(out, require_data("pocket", data), Preparation(cache=cache).folder, val, chosen, watched)
+        folder = require_data("pocket", data)
+        card = train_and_measure(
+            "pocket", out, folder, Preparation(cache=cache).folder, val, chosen, watched, held_out.evaluate
+        )
+        _report(card)
+        print(f"log       {out}.log")
     return 0
-
-
-def _train(out: Path, data: Path, cache: Path, val: str, recipe: PocketRecipe, watched: Mapping[str, Any]) -> None:
-    from wiw.datasets.navigation import NavigationData
-    from wiw.training.pocket import train as training
-    from wiw.training.pocket.held_out import evaluate
-    from wiw.world_models.pocket.model import Pocket
-    from wiw.world_models.pocket.weights import load, save
-
-    _check_held_out(val, NavigationData(data, watched["part"], recipe.held_out))  # before hours of training
-    with TrainingProgress(recipe.batch, "clips") as progress:
-        card = training.train_pocket(
-            data,
-            out,
-            cache,
-            recipe,
-            on_step=progress,
-            on_validation=progress.show_validation,
-            bar=track_items,
-            **watched,
-        )
-    card["val"] = val
-    card["held_out"] = evaluate(Pocket(out), val, recipe.seed, bar=track_items)
-    save(out, load(out)[0], card)
-    _report(card)
-    print(f"log       {out}.log")
-
-
-def _check_held_out(val: str, data: NavigationData) -> None:
-    """Check that scenes exist and are not trained on; a dataset identifies its scenes only by name."""
-    from wiw.datasets.scene_splits import name_scene
-    from wiw.scenes import resolve, strip_edits
-
-    trained = {strip_edits(row["scene"]) for row in data.segments}
-    shared = next((spec for spec in resolve(val) if strip_edits(name_scene(spec)) in trained), None)
-    if shared is not None:
-        raise ArgumentError(
-            f"--val: expected held-out scenes, got {shared}, but {data.folder} has a scene of that name to train on; "
-            "choose others"
-        )
 
 
 def _report(card: Mapping[str, Any]) -> None:

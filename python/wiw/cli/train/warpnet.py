@@ -3,42 +3,62 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Annotated, Any, Literal
 
 from tyro.conf import arg
 
+from wiw.cli.options import Options
+from wiw.cli.train.corpus import describe_steps
+from wiw.cli.train.on_clips import train_and_measure
 from wiw.cli.train.progress import TrainingProgress, track_items
 from wiw.cli.train.small_networks import NO_LIMITS, VAL_SCENES, Count, Limits, check_counts, drop_none, write_weights
+from wiw.errors import ArgumentError
 from wiw.training.preparation import PREPARATION, Preparation
+
+SCENES = "apartments:train:80"
+"""Whose walks are recorded, unless the user says otherwise."""
 
 
 def train_warpnet(
     *,
     out: Annotated[Path, arg(metavar="FILE")] = Path("warpnet.safetensors"),
-    scenes: Annotated[str, arg(metavar="SPEC")] = "apartments:train:80",
+    scenes: Annotated[str, arg(metavar="SPEC")] = SCENES,
+    data: Annotated[Path | None, arg(metavar="DIR", help_behavior_hint="")] = None,
     val: Annotated[str, arg(metavar="SPEC")] = VAL_SCENES,
     places: Count = None,
     epochs: Count = None,
     limits: Annotated[Limits, arg(name="")] = NO_LIMITS,
+    option: Options = (),
+    part: Literal["train", "all"] = "train",
+    validation: Annotated[Path | None, arg(metavar="DIR", help_behavior_hint="")] = None,
     preparation: Annotated[Preparation, arg(name="")] = PREPARATION,
 ) -> int:
     """Train warpnet, a world model for navigation that predicts the panorama seen from a place nearby.
 
     $ wiw train warpnet --out warpnet.safetensors
+    $ wiw train warpnet --data data --out warpnet.safetensors       # on what `wiw collect navigation` has left
     $ wiw run imagenav --world-model warpnet --world-model-option weights=warpnet.safetensors
 
     Walks through the scenes are rendered and cached first, so that an interrupted command does not render them again.
     Training takes 15 to 30 minutes on two idle cores. FILE also holds the recipe, and PSNR and SSIM on the val scenes,
     next to copy and warp. The weights shipped with wiw were trained by this command with its defaults.
 
+    With --data, it trains on the clips of a dataset instead, in their order of post-training: validated on scenes that
+    are left out, resumed exactly when the command is repeated, and with a log beside FILE.
+
     Args:
         out: File for the weights (safetensors).
         scenes: Training scenes: apartments:train[:N], a mesh, a Gazebo world or scans, as in `wiw run`.
+        data: Dataset of `wiw collect navigation`, with depth, to train on in place of walks.
         val: Held-out scenes for evaluation; none may be trained on.
         places: Walks recorded per scene. Default: 24.
-        epochs: Number of epochs: how often each sample is used, on average. Default: 6.
+        epochs: Number of epochs: how often each sample is used, on average. Default: 6. With --data: 3.
+        option: With --data: override a value of its recipe, such as clips=1600 or batch=8; may be repeated. See
+            `wiw.training.warpnet_clips.WarpNetClipRecipe`.
+        part: With --data: the part to train on; train holds out one in twenty scenes for validation.
+        validation: With --data: another dataset, with other scenes, for validation. Default: the scenes held out.
         limits: Time limit and seed.
         preparation: How training data is prepared.
     """
@@ -47,7 +67,12 @@ def train_warpnet(
 
     check_counts(places=places, epochs=epochs)
     require(WarpNet.requires)
+    watched = {"part": part, "validation": validation}
+    _check_source(data, scenes, places, limits, option, watched)
     with write_weights("warpnet", out):
+        if data is not None:
+            _train_on_data(out, data, val, epochs, limits.seed, option, watched, preparation)
+            return 0
         from wiw.training import warpnet as training
         from wiw.training.walks import WalkRules
 
@@ -57,13 +82,60 @@ def train_warpnet(
             card = training.make_weights(
                 out, scenes, val, rules, recipe, limits.minutes, preparation, progress, track_items
             )
-        _report(card)
+        print(f"{card['ways']} walks, {card['recipe']['epochs']} epochs")
+        _report(card["held_out"])
     return 0
 
 
-def _report(card: Mapping[str, Any]) -> None:
-    held_out = card["held_out"]
-    print(f"{card['ways']} walks, {card['recipe']['epochs']} epochs; held out: {held_out['ways']} walks")
+def _check_source(
+    data: Path | None,
+    scenes: str,
+    places: int | None,
+    limits: Limits,
+    option: Sequence[str],
+    watched: Mapping[str, Any],
+) -> None:
+    """Refuse options that what is trained on does not have."""
+    if data is None:
+        found = {
+            "--option": bool(option),
+            "--part": watched["part"] != "train",
+            "--validation": watched["validation"] is not None,
+        }
+        source = "walks; they go with --data"
+    else:
+        found = {"--scenes": scenes != SCENES, "--places": places is not None, "--minutes": limits.minutes is not None}
+        source = "--data, which has its own scenes and clips (--option clips=N for fewer)"
+    if given := [name for name, is_given in found.items() if is_given]:
+        raise ArgumentError(f"{given[0]} has no effect on a training on {source}; leave it out")
+
+
+def _train_on_data(
+    out: Path,
+    data: Path,
+    val: str,
+    epochs: int | None,
+    seed: int,
+    option: Sequence[str],
+    watched: Mapping[str, Any],
+    preparation: Preparation,
+) -> None:
+    from wiw.runs.part_options import parse_options
+    from wiw.training.post_training.recipe import load_recipe
+    from wiw.training.warpnet import evaluate
+    from wiw.training.warpnet_clips import WarpNetClipRecipe
+
+    numbers = drop_none({"epochs": epochs, "seed": seed or None})
+    options = {**numbers, **parse_options(option, WarpNetClipRecipe, "--option")}
+    recipe = load_recipe("warpnet", options=options, kind=WarpNetClipRecipe)
+    card = train_and_measure("warpnet", out, data, preparation.folder, val, recipe, watched, evaluate)
+    print(describe_steps(card, recipe.batch))
+    _report(card["held_out"])
+    print(f"log       {out}.log")
+
+
+def _report(held_out: Mapping[str, Any]) -> None:
+    print(f"held out: {held_out['ways']} walks")
     print(f"{'steps of 0.2 m ahead':<20}" + "".join(f"{steps:>15}" for steps in held_out["psnr"]["copy"]))
     for name in held_out["psnr"]:
         cells = [f"{held_out['psnr'][name][n]:8.1f} {held_out['ssim'][name][n]:6.3f}" for n in held_out["psnr"][name]]

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Train pocket on a navigation dataset, or resume its training, and write its weights."""
+"""Train a small world model, pocket or warpnet, on a navigation dataset, or resume, and write its weights."""
 
 from __future__ import annotations
 
@@ -18,10 +18,11 @@ from wiw.errors import WeightsError
 from wiw.files import atomic_file
 from wiw.networks import memory_guard
 from wiw.training.held_out_clips import Frames, Imagine, imagine_with
-from wiw.training.pocket.recipe import PocketRecipe
-from wiw.training.pocket.trainer import PocketTrainer
+from wiw.training.learners import Learner, make_learner
+from wiw.training.place_trainer import PlaceTrainer
 from wiw.training.post_training.clip_trainer import arrange_clips
 from wiw.training.post_training.corpora import NavigationCorpus, require_panoramas, require_training_split
+from wiw.training.post_training.recipe import ClipRecipe
 from wiw.training.post_training.stop_signals import SignalledCheckpoint
 from wiw.training.post_training.train import train_and_validate
 from wiw.training.post_training.validation import (
@@ -33,18 +34,17 @@ from wiw.training.post_training.validation import (
 )
 from wiw.training.reduced_frames import Bar, reduce_frames
 from wiw.types import Conditioning
-from wiw.world_models.pocket.model import Pocket
-from wiw.world_models.pocket.weights import load, save
 
-BEST = "pocket.safetensors"
+BEST = "weights.safetensors"
 """Name of the best weights so far, in the log's folder."""
 
 
-def train_pocket(
+def train_on_clips(
+    name: str,
     data: str | Path,
     out: Path,
     cache: Path,
-    recipe: PocketRecipe,
+    recipe: ClipRecipe,
     part: Part = "train",
     validation: str | Path | None = None,
     decisions: str | Path | None = None,
@@ -62,6 +62,7 @@ def train_pocket(
     `OUT.log` has the loss of each step and what validations found.
 
     Args:
+        name: of the world model, one of `wiw.training.learners.LEARNERS`.
         data: folder of `wiw collect navigation`, of panoramas.
         out: file of the weights.
         cache: folder of frames in the recipe's size, which are made once.
@@ -79,16 +80,18 @@ def train_pocket(
         The card in the file: data, recipe, steps, validation and the loss at the end.
 
     Raises:
-        ArgumentError: a dataset of perspective views or of scenes for evaluation, too few clips, a state of a training
-            with other data or numbers, or validation on scenes that are trained on or not there.
+        ArgumentError: an unknown model, a dataset of perspective views or of scenes for evaluation, too few clips, a
+            state of a training with other data or numbers, or validation on scenes that are trained on or not there.
         TrainingError: the loss is not finite; the last good state is kept, the message names the batch.
         FileError: the dataset is missing or damaged, or a file cannot be written.
         DeviceMemoryError: memory does not suffice.
+        DependencyError: torch or safetensors is not installed.
     """
+    learner = make_learner(name)
 
     def open_part(folder: str | Path, wanted: Part) -> NavigationCorpus:
         found = NavigationCorpus(NavigationData(folder, wanted, recipe.held_out), wanted)
-        require_panoramas("pocket", found)
+        require_panoramas(name, found)
         return found
 
     corpus = open_part(data, part)
@@ -102,31 +105,31 @@ def train_pocket(
         checked = build_validation_set(held_out, chosen, decisions, recipe)
     card: dict[str, Any] = {"wiw": wiw.__version__, "data": corpus.describe(), "recipe": recipe.describe()}
     card |= {"validated_on": checked.identity if checked else None}
-    if (finished := _read_finished(out, card)) is not None:
+    if (finished := _read_finished(learner, out, card)) is not None:
         return finished
-    trainer = PocketTrainer(clips, reduce_frames(dataset, recipe.size, cache, bar), recipe)
-    state = SignalledCheckpoint(out.with_name(f"{out.name}.checkpoint"), {"model": "pocket", **card}, seconds)
-    with memory_guard("training pocket", f"lower batch (now {recipe.batch}) or places (now {recipe.places})"):
+    trainer = learner.trainer(clips, reduce_frames(dataset, recipe.clip_size, cache, bar), recipe)
+    state = SignalledCheckpoint(out.with_name(f"{out.name}.checkpoint"), {"model": name, **card}, seconds)
+    with memory_guard(f"training {name}", f"lower batch (now {recipe.batch}), or choose a smaller size or network"):
         validated = train_and_validate(
             trainer,
-            create_sampler(trainer),
+            create_sampler(learner, trainer),
             checked,
             out,
-            lambda best, found: _save_best(best, trainer, found),
+            lambda best, found: _save_best(learner, best, trainer, found),
             state,
             tracker,
             on_step,
             on_validation,
         )
     card |= {"trained_steps": trainer.step_count, "loss": trainer.mean_loss}
-    card = _publish_weights(out, validated, trainer, card)
+    card = _publish_weights(learner, out, validated, trainer, card)
     state.remove()
     return card
 
 
-def create_sampler(trainer: PocketTrainer) -> Imagine:
-    """Return how the network in training imagines, with its averaged weights."""
-    imagine = imagine_with(Pocket.of(trainer.network))
+def create_sampler(learner: Learner, trainer: PlaceTrainer) -> Imagine:
+    """Return how the network in training imagines, with its averaged weights if there are any."""
+    imagine = imagine_with(learner.model.of(trainer.network))
     trainer.network.train()
 
     def imagine_now(
@@ -142,34 +145,34 @@ def create_sampler(trainer: PocketTrainer) -> Imagine:
     return imagine_now
 
 
-def _read_finished(out: Path, identity: Mapping[str, Any]) -> dict[str, Any] | None:
+def _read_finished(learner: Learner, out: Path, identity: Mapping[str, Any]) -> dict[str, Any] | None:
     """Return the card of weights that the same training has written and nobody has measured; None if there are none."""
     try:
-        card = load(out)[1]
+        card = learner.load(out)[1]
     except WeightsError:
         return None
     same = all(card.get(name) == value for name, value in json.loads(json.dumps(identity)).items())
     return card if same and "held_out" not in card else None
 
 
-def _save_best(folder: Path, trainer: PocketTrainer, found: Mapping[str, Any]) -> None:
+def _save_best(learner: Learner, folder: Path, trainer: PlaceTrainer, found: Mapping[str, Any]) -> None:
     with trainer.use_averages():
-        save(folder / BEST, trainer.network, found)
+        learner.save(folder / BEST, trainer.network, found)
     with atomic_file(folder / CARD) as draft:
         draft.write_text(json.dumps(found, indent=2) + "\n", encoding="utf-8")
 
 
 def _publish_weights(
-    out: Path, validated: ValidatedTrainer, trainer: PocketTrainer, card: Mapping[str, Any]
+    learner: Learner, out: Path, validated: ValidatedTrainer, trainer: PlaceTrainer, card: Mapping[str, Any]
 ) -> dict[str, Any]:
     """Write the best weights in validation, or the last ones without it; return their card."""
     if not validated.best.exists():
         found = {**card, "steps": trainer.step_count}
         with trainer.use_averages():
-            save(out, trainer.network, found)
+            learner.save(out, trainer.network, found)
         return found
-    network, own = load(validated.best / BEST)
+    network, own = learner.load(validated.best / BEST)
     found = {**card, **own}
-    save(out, network, found)
+    learner.save(out, network, found)
     shutil.rmtree(validated.best)
     return found
