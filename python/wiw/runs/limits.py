@@ -32,7 +32,7 @@ class Limits:
     infrastructure error, which is excluded from scores."""
     stall: Annotated[float | None, arg(metavar="SECONDS")] = None
     """Time in seconds without news from a worker process or Ray actor, such as a decision, after which it is stopped as
-    hung, and its episodes begin again. Default: 24 times --deadline, which is 2 hours."""
+    hung, and its episodes begin again; more than a model takes to load. Default: 24 times --deadline, 2 hours."""
     cache: Annotated[str | Path, arg(metavar="auto|off|DIR")] = "auto"
     """Where rollouts are cached, so that a model never computes the same one twice: auto (in ~/.cache/wiw/rollouts, for
     models that declare themselves cacheable), a folder (for every model), or off."""

@@ -39,6 +39,8 @@ _RESEED = 0x52455345
 """Keeps the seeds of arms that repeat another apart from all other draws."""
 TRIES = 2
 """How often an episode is started if its worker dies."""
+START_SECONDS = 600.0
+"""Time that a worker has at least for importing and for building its task."""
 NUMBERS = {2: "twice", 3: "three times"}
 
 
@@ -248,7 +250,7 @@ class _WorkerPool:
             self._receive(by_pipe[pipe])  # type: ignore[index]
 
     def _hangs(self, worker: _Worker) -> bool:
-        return worker.silence.seconds > self._patience
+        return worker.silence.seconds > (self._patience if worker.ready else max(self._patience, START_SECONDS))
 
     def stop(self) -> None:
         for worker in self._workers:

@@ -67,7 +67,7 @@ def test_a_worker_that_hangs_is_replaced_and_costs_no_result(tmp_path: Path) -> 
     """In code that has no deadline of its own; the others go on meanwhile."""
     agent = LineAgent(kill=(4,), hangs=True, marker=str(tmp_path / "marker"))
     found = []
-    for name, own, options in (("quiet", LineAgent(), {}), ("hung", agent, {"workers": 2, "stall": 4.0})):
+    for name, own, options in (("quiet", LineAgent(), {}), ("hung", agent, {"workers": 2, "stall": 8.0})):
         run_arms(LineTask(), {"a": own}, 10, out=tmp_path / name, progress=False, salt="", **options)
         found.append(facts(tmp_path / name)[:3])
     assert (tmp_path / "marker").exists() and found[0] == found[1]
@@ -75,7 +75,7 @@ def test_a_worker_that_hangs_is_replaced_and_costs_no_result(tmp_path: Path) -> 
 
 def test_an_episode_that_hangs_every_worker_is_an_error(tmp_path: Path) -> None:
     agent = LineAgent(kill=(4,), hangs=True)
-    log = run_arms(LineTask(), {"a": agent}, 6, out=tmp_path / "run", progress=False, workers=2, stall=4.0, live=1)
+    log = run_arms(LineTask(), {"a": agent}, 6, out=tmp_path / "run", progress=False, workers=2, stall=8.0, live=1)
     assert len(log.episodes) == 6
     (error,) = [row for row in log.episodes if row["status"] == "error"]
     assert (error["episode"], error["kind"]) == (4, "worker")
