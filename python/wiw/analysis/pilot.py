@@ -46,9 +46,7 @@ PILOTS = {
     ),
     "ar": Pilot(84.4, 3.1, 0.05, 5, "warp and none, 225 test episodes: 7 won, 7 lost"),
     "ar-foresight": Pilot(62.0, 6.4, 0.05, 5, "warpnet and none, 250 test episodes: 26 won, 16 lost"),
-    "aeqa": Pilot(
-        46.1, 4.0, 0.05, 5, "warpnet and none, 300 test questions: the Score's difference scatters by 36 points"
-    ),
+    "aeqa": Pilot(68.3, 5.3, 0.05, 5, "oracle and none, 300 test questions: 22 won, 16 lost"),
     "manipulation": Pilot(74.5, 5.0, 0.0, 1, "armnet and none, 200 tables: 10 lost"),
 }
 """By task, and tier or preset: two arms as `docs/results.md` has them.
