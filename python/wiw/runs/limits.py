@@ -15,8 +15,10 @@ from wiw.loop.limits import BUDGET_GB, DEADLINE
 
 NO_DEADLINE = 1e12
 """Seconds that stand for no deadline where a number must be stored."""
-CALLS = 24
+STALL_DEADLINES = 24
 """Deadlines that pass without news before a worker counts as hung: a decision may make many calls."""
+LEAST_STALL = 7200.0
+"""Seconds without news that are allowed by default: not everything that takes long has a deadline."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -32,7 +34,7 @@ class Limits:
     infrastructure error, which is excluded from scores."""
     stall: Annotated[float | None, arg(metavar="SECONDS")] = None
     """Time in seconds without news from a worker process or Ray actor, such as a decision, after which it is stopped as
-    hung, and its episodes begin again; more than a model takes to load. Default: 24 times --deadline, 2 hours."""
+    hung, and its episodes begin again; more than a model takes to load. Default: 2 hours, or 24 times --deadline."""
     cache: Annotated[str | Path, arg(metavar="auto|off|DIR")] = "auto"
     """Where rollouts are cached, so that a model never computes the same one twice: auto (in ~/.cache/wiw/rollouts, for
     models that declare themselves cacheable), a folder (for every model), or off."""
@@ -58,7 +60,7 @@ class Limits:
     @property
     def patience(self) -> float:
         """Seconds without news after which a worker counts as hung; infinite in one with no deadline for its calls."""
-        patience = CALLS * self.deadline if self.stall is None else self.stall
+        patience = max(LEAST_STALL, STALL_DEADLINES * self.deadline) if self.stall is None else self.stall
         return patience if patience < NO_DEADLINE else math.inf
 
     @property

@@ -9,7 +9,6 @@ One that sends nothing for long is hung, in code that has no deadline of its own
 
 from __future__ import annotations
 
-import math
 import os
 import pickle
 import signal
@@ -200,7 +199,7 @@ class Silence:
 
     def describe(self) -> str:
         """Return why the worker was ended."""
-        return f"no news for {self.seconds:.0f} s, in code without a deadline (--stall)"
+        return f"no news for {self.seconds:.0f} s: hung, or slower than --stall allows"
 
 
 def choose_tick(patience: float) -> float:
@@ -221,16 +220,14 @@ class _Worker:
 class _WorkerPool:
     """The parent's side: assigns jobs to workers, receives their rows, and replaces workers that died or hang."""
 
-    def __init__(
-        self, spec: bytes, jobs: deque[Job], receiver: ReportReceiver, size: int, patience: float = math.inf
-    ) -> None:
+    def __init__(self, spec: bytes, jobs: deque[Job], receiver: ReportReceiver, size: int, patience: float) -> None:
         self._spec, self._jobs, self._receiver, self._patience = spec, jobs, receiver, patience
         self._size = min(size, len(jobs))
         self._workers: list[_Worker] = []
 
     def run(self) -> None:
         while self._jobs or any(worker.job for worker in self._workers):
-            for worker in [worker for worker in self._workers if worker.ready and worker.job is None]:
+            for worker in [worker for worker in self._workers if self._is_free(worker)]:
                 self._assign(worker)
             while len(self._workers) < self._size and self._jobs:
                 self._workers.append(_start(self._spec, self._size))
@@ -248,6 +245,9 @@ class _WorkerPool:
                 worker.process.kill()  # its pipe then ends
         for pipe in ready:
             self._receive(by_pipe[pipe])  # type: ignore[index]
+
+    def _is_free(self, worker: _Worker) -> bool:
+        return worker.ready and worker.job is None and not self._hangs(worker)
 
     def _hangs(self, worker: _Worker) -> bool:
         return worker.silence.seconds > (self._patience if worker.ready else max(self._patience, START_SECONDS))

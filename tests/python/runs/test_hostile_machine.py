@@ -79,7 +79,7 @@ def test_an_episode_that_hangs_every_worker_is_an_error(tmp_path: Path) -> None:
     assert len(log.episodes) == 6
     (error,) = [row for row in log.episodes if row["status"] == "error"]
     assert (error["episode"], error["kind"]) == (4, "worker")
-    assert re.search(r"died twice on this episode, last: no news for \d+ s, .*--stall", error["error"])
+    assert re.search(r"died twice on this episode, last: no news for \d+ s: .*--stall", error["error"])
 
 
 def test_silence_is_what_was_waited_for_since_the_last_news() -> None:
@@ -87,7 +87,12 @@ def test_silence_is_what_was_waited_for_since_the_last_news() -> None:
     for has_news, waited, seconds in ((False, 3, 3), (False, 3, 6), (True, 3, 0), (False, 2, 2)):
         silence.note(has_news, waited)
         assert silence.seconds == seconds
-    assert [Limits(**given).patience for given in ({}, {"stall": 9.0}, {"deadline": 1e12})] == [7200, 9, math.inf]
+    assert [Limits(**given).patience for given in ({}, {"stall": 9.0}, {"deadline": 1.0}, {"deadline": 1e12})] == [
+        7200,
+        9,
+        7200,
+        math.inf,
+    ]
     with pytest.raises(ArgumentError, match="expected a stall above 0"):
         Limits(stall=0.0)
 

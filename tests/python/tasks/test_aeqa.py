@@ -209,7 +209,7 @@ def marked(episode) -> Episode:
 def knows(thing: Any) -> bool:
     """Whether the canary is anywhere in a thing, however deep: arrays, texts, private parts."""
     held = pickle.dumps(thing)
-    numbers = (np.array(NUMBER, kind).tobytes() for kind in (np.int32, np.float32, np.float64))
+    numbers = [np.array(NUMBER, kind).tobytes() for kind in (np.int32, np.float32, np.float64, ">f8")]
     return CANARY.encode() in held or any(number in held for number in numbers)
 
 
@@ -222,6 +222,7 @@ def test_the_goal_is_the_text_alone(marked):
             seen.extend(situations)
             return super().propose(situations, candidates, horizon)
 
+    assert all(map(knows, (CANARY, NUMBER, float(NUMBER), (float(NUMBER),))))
     assert (
         knows(marked)
         and knows(np.array([NUMBER, 1.0]))

@@ -5,7 +5,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any, Literal
+from typing import Annotated, Any, Literal
 
 from tyro.conf import arg
 
@@ -14,9 +14,6 @@ from wiw.cli.train.corpus import TrackerName, describe_steps, require_data
 from wiw.cli.train.on_clips import train_and_measure
 from wiw.cli.train.small_networks import VAL_SCENES, Count, check_counts, check_seed, drop_none, write_weights
 from wiw.training.preparation import Preparation
-
-if TYPE_CHECKING:
-    pass
 
 
 def train_pocket(
