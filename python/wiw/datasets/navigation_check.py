@@ -16,7 +16,7 @@ from wiw.datasets.navigation import META, NavigationData
 from wiw.datasets.navigation_files import FrameFile
 from wiw.datasets.navigation_segment import NavigationSegment, describe_segment
 from wiw.datasets.parquet_files import hash_file
-from wiw.datasets.scene_splits import find_named_split
+from wiw.datasets.scene_splits import list_evaluation_scenes
 from wiw.errors import FileError
 from wiw.scenes import strip_edits
 
@@ -123,9 +123,8 @@ def _check_splits(data: NavigationData, found: Verification) -> None:
     """Look for scenes that evaluation uses."""
     if data.meta["split"] != "train":
         found.add("split", f"{data.folder}: expected split train, got {data.meta['split']}")
-    for scene in sorted({row["scene"] for row in data.segments}):
-        if (split := find_named_split(scene)) is not None:
-            found.add("split", f"{data.folder}: {scene} is of split {split}, which is for evaluation")
+    for scene, split in list_evaluation_scenes(row["scene"] for row in data.segments):
+        found.add("split", f"{data.folder}: {scene} is of split {split}, which is for evaluation")
 
 
 def _check_leaks(datasets: Sequence[NavigationData], found: Verification) -> None:

@@ -3,6 +3,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterable
 from os import PathLike, fspath
 from pathlib import Path
 
@@ -48,6 +49,12 @@ def find_evaluation_split(spec: str | PathLike[str]) -> str | None:
     named = (find_named_split(part.partition(".")[0]) for part in path.parts)
     folders = (part.lower() for part in path.parent.parts if part.lower() in FOLDERS)
     return next((split for split in (*named, *folders) if split is not None), None)
+
+
+def list_evaluation_scenes(names: Iterable[str]) -> list[tuple[str, str]]:
+    """Return the scenes of a dataset that are for evaluation, each once with its split, sorted by name."""
+    found = ((name, find_named_split(name)) for name in sorted(set(names)))
+    return [(name, split) for name, split in found if split is not None]
 
 
 def find_named_split(name: str) -> str | None:

@@ -2,10 +2,10 @@
 """Run episodes in Ray actors, on this machine or on a Ray cluster. This process alone writes what they report.
 
 An actor is a worker as in `workers.py`: it builds task and agents from recipes, leases one job at a time and sends its
-rows as they come, which are the lease's heartbeat: an actor without any for too long is hung, and is killed. Ray tells
-when an actor, its process or its node is lost; what the job had not finished is then leased again, one episode at a
-time, at most `TRIES` times. So is an episode that a lost server of the run (`ray_servers.py`) has cost. No object of
-Ray's gets into the results.
+rows as they come, which are the lease's heartbeat: an actor that has a job and sends none for too long is hung, and is
+killed. Ray tells when an actor, its process or its node is lost; what the job had not finished is then leased again,
+one episode at a time, at most `TRIES` times. So is an episode that a lost server of the run (`ray_servers.py`) has
+cost. No object of Ray's gets into the results.
 """
 
 from __future__ import annotations

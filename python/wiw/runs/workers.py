@@ -4,7 +4,7 @@
 Workers are spawned, never forked: a forked child hangs in an OpenGL context it did not make. Each asks for one job at a
 time and sends rows back; this process alone writes them. A worker that dies takes no episode with it: what it had not
 finished is run once more, one episode at a time, and only an episode that kills its worker twice is recorded as failed.
-One that sends nothing for long is hung, in code that has no deadline of its own, and is killed.
+One that has a job and sends nothing for long is hung, in code that has no deadline of its own, and is killed.
 """
 
 from __future__ import annotations
@@ -38,8 +38,6 @@ _RESEED = 0x52455345
 """Keeps the seeds of arms that repeat another apart from all other draws."""
 TRIES = 2
 """How often an episode is started if its worker dies."""
-START_SECONDS = 600.0
-"""Time that a worker has at least for importing and for building its task."""
 NUMBERS = {2: "twice", 3: "three times"}
 
 
@@ -239,8 +237,8 @@ class _WorkerPool:
         began, tick = time.monotonic(), choose_tick(self._patience)
         ready = wait(list(by_pipe), tick)
         for worker in [worker for worker in self._workers if not self._hangs(worker)]:
-            idle = worker.ready and worker.job is None
-            worker.silence.note(idle or worker.pipe in ready, min(time.monotonic() - began, tick))
+            has_news = worker.job is None or worker.pipe in ready  # one that starts or waits has none to send
+            worker.silence.note(has_news, min(time.monotonic() - began, tick))
             if self._hangs(worker):
                 worker.process.kill()  # its pipe then ends
         for pipe in ready:
@@ -250,7 +248,7 @@ class _WorkerPool:
         return worker.ready and worker.job is None and not self._hangs(worker)
 
     def _hangs(self, worker: _Worker) -> bool:
-        return worker.silence.seconds > (self._patience if worker.ready else max(self._patience, START_SECONDS))
+        return worker.silence.seconds > self._patience
 
     def stop(self) -> None:
         for worker in self._workers:

@@ -172,9 +172,11 @@ class AEQA(NavigationTask):
             FileError: the file cannot be read, an episode has no question or a bad one, or two have the same id.
         """
         assert self.episode_file is not None
-        published = isinstance(read_json(self.episode_file), list)
-        found = openeqa.load(self.episode_file, self.scene_folder) if published else super().load_episodes()
-        _check_questions(found, self.episode_file)
+        if isinstance(read_json(self.episode_file), list):
+            found = openeqa.load(self.episode_file, self.scene_folder)
+        else:
+            found = super().load_episodes()
+            _check_questions(found, self.episode_file)
         return [_describe(episode) for episode in found]
 
     def episodes(self, count: int) -> list[Episode]:

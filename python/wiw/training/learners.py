@@ -29,8 +29,6 @@ class Learner:
     trainer: type[PlaceTrainer]
     create_recipe: Callable[..., ClipRecipe]
     """Returns the recipe of a study, given `frames`, `size`, `batch`, `clips` and `seed`."""
-    recipe: type[ClipRecipe]
-    """Class of its recipes; the shipped one is `wiw/configs/post-training/NAME.yaml`."""
     load: Callable[[Path], tuple[Any, dict[str, Any]]]
     """Reads a file of weights into a network and its card."""
     save: Callable[[Path, Any, Mapping[str, Any]], None]
@@ -52,12 +50,11 @@ def make_learner(name: str) -> Learner:
         from wiw.training.warpnet_clips import WarpNetClipRecipe, WarpNetClipTrainer
         from wiw.world_models.warpnet import weights as warpnet
 
-        return Learner(model, WarpNetClipTrainer, WarpNetClipRecipe, WarpNetClipRecipe, warpnet.load, warpnet.save)
-    from wiw.training.pocket.recipe import PocketRecipe
+        return Learner(model, WarpNetClipTrainer, WarpNetClipRecipe, warpnet.load, warpnet.save)
     from wiw.training.pocket.trainer import PocketTrainer
     from wiw.world_models.pocket import weights as pocket
 
-    return Learner(model, PocketTrainer, _create_pocket_recipe, PocketRecipe, pocket.load, pocket.save)
+    return Learner(model, PocketTrainer, _create_pocket_recipe, pocket.load, pocket.save)
 
 
 def _create_pocket_recipe(**numbers: Any) -> ClipRecipe:

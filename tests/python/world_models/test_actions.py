@@ -203,11 +203,11 @@ def test_equal_loras_are_equal_bytes(made, tmp_path: Path) -> None:
     assert len(set(files)) == 1
     with safe_open(folder / "pytorch_lora_weights.safetensors", "pt") as read:
         said = json.loads(read.metadata()["lora_adapter_metadata"])
-        assert read.metadata()["format"] == "pt" and len(list(read.keys())) == 2 * said_layers(model)
+        assert read.metadata()["format"] == "pt" and len(list(read.keys())) == 2 * count_lora_layers(model)
     assert said["transformer.target_modules"] == sorted(said["transformer.target_modules"])
 
 
-def said_layers(model) -> int:
+def count_lora_layers(model) -> int:
     """Number of layers of the denoiser that the LoRA is on."""
     return sum(name.endswith("lora_A.actions") for name, _ in model.generator.pipeline.transformer.named_modules())
 

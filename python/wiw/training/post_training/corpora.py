@@ -23,7 +23,7 @@ from wiw.datasets.demonstration import Outline, name_demonstration
 from wiw.datasets.demonstrations import Demonstrations, read_manifest
 from wiw.datasets.navigation import META, Clips, NavigationData, Part, part_of
 from wiw.datasets.parquet_files import MANIFEST
-from wiw.datasets.scene_splits import find_named_split
+from wiw.datasets.scene_splits import list_evaluation_scenes
 from wiw.errors import ArgumentError, FileError
 from wiw.training.held_out_clips import HeldOutClips
 from wiw.training.held_out_demonstrations import DemonstratedPlan, select_demonstrations
@@ -128,12 +128,10 @@ def require_training_split(corpus: Corpus) -> None:
     """Raise ArgumentError where a corpus has scenes of a split for evaluation, on which nothing is trained."""
     if not isinstance(corpus, NavigationCorpus):
         return
-    named = {scene: find_named_split(scene) for scene in sorted(corpus.units)}
-    found = next(((scene, split) for scene, split in named.items() if split is not None), None)
-    stated = corpus.data.meta.get("split", "train")
-    if found is None and stated == "train":
+    found, stated = list_evaluation_scenes(corpus.units), corpus.data.meta.get("split", "train")
+    if not found and stated == "train":
         return
-    what = f"scene {found[0]} of split {found[1]}" if found else f"split {stated}"
+    what = f"scene {found[0][0]} of split {found[0][1]}" if found else f"split {stated}"
     raise ArgumentError(
         f"{corpus.data.folder}: expected scenes of a train split, got {what}: a model trained on scenes that it is "
         "evaluated on proves nothing; collect from a train split, such as apartments:train:80"

@@ -220,8 +220,8 @@ def _run_steps(
             )
             trainer.validate()
         except (TrainingError, FileError) as error:
-            everywhere = isinstance(error, TrainingError) or distributed.count_processes() == 1
-            if trainer.step_count and everywhere and trainer.is_logged:
+            alone = distributed.count_processes() == 1 and trainer.is_logged
+            if trainer.step_count and (alone or isinstance(error, TrainingError)):
                 state.save(trainer, recipe.epochs, trainer.step_count)
             raise
         finally:

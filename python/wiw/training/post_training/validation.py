@@ -190,8 +190,8 @@ class ValidatedTrainer(ResumableTrainer):
 
     @property
     def is_logged(self) -> bool:
-        """Whether the log has the last step, so that a state belongs to it; always true where another process logs."""
-        return not distributed.is_main() or self._log.step == self.step_count
+        """Whether the log has the last step, so that a state belongs to it; to be asked in the process that logs."""
+        return self._log.step == self.step_count
 
     def train_step(self, learning_rate: float) -> float:
         """Validate if it is time, then train on one batch and return its loss.
