@@ -4,6 +4,7 @@
 from __future__ import annotations
 
 from abc import abstractmethod
+from dataclasses import replace
 from hashlib import blake2b
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, TypeVar
@@ -16,19 +17,6 @@ if TYPE_CHECKING:
     from torch import nn
 
 T = TypeVar("T", bound="Trained")
-
-
-def require_size(name: str, size: tuple[int, int], smallest: tuple[int, int]) -> None:
-    """Check the (height, width) that a model is to draw in, where its network computes in a smaller one.
-
-    Raises:
-        ArgumentError: it is smaller than that of the network.
-    """
-    if len(size) != 2 or any(given < least for given, least in zip(size, smallest, strict=True)):
-        raise ArgumentError(
-            f"{name}: expected a size (height, width) of at least {tuple(smallest)}, in which the network computes, "
-            f"got {tuple(size)}"
-        )
 
 
 class Trained(WorldModel):
@@ -45,6 +33,8 @@ class Trained(WorldModel):
     version = "1"
     immaterial = ("weights",)
     requires = Requirements(("torch", "safetensors"), "torch")
+    size: tuple[int, int] | None = None
+    """(height, width) that was chosen for what it sees and draws; None if the declared one was left as it is."""
     _network: Any
 
     def __init__(self, weights: str | Path | None = None) -> None:
@@ -64,16 +54,32 @@ class Trained(WorldModel):
         model.weights, model._network, model.card = None, network.eval(), {}
         return model
 
+    def choose_size(self, size: tuple[int, int]) -> None:
+        """Choose the (height, width) of what the model sees and draws; its network computes in a smaller one.
+
+        Raises:
+            ArgumentError: it is smaller than that of the network.
+        """
+        smallest = self._network.size
+        if len(size) != 2 or any(given < least for given, least in zip(size, smallest, strict=True)):
+            raise ArgumentError(
+                f"{type(self).__name__.lower()}: expected a size (height, width) of at least {tuple(smallest)}, in "
+                f"which the network computes, got {tuple(size)}"
+            )
+        height, width = map(int, size)
+        self.size, self.accepts = size, replace(self.accepts, size=(height, width))
+
     def describe(self) -> dict[str, Any]:
-        """Return the weights' file, a digest of them, and torch's version."""
+        """Return the weights' file, a digest of them, torch's version, and the size if one was chosen."""
         import torch
 
-        return {
+        found = {
             "name": type(self).__name__,
             "weights": self.weights,
             "digest": self._digest(),
             "torch": torch.__version__,
         }
+        return found if self.size is None else {**found, "size": list(self.size)}
 
     def _digest(self) -> str:
         digest = blake2b(digest_size=8)

@@ -38,15 +38,15 @@ def train_warpnet(
     """Train warpnet, a world model for navigation that predicts the panorama seen from a place nearby.
 
     $ wiw train warpnet --out warpnet.safetensors
-    $ wiw train warpnet --data data --out warpnet.safetensors       # on what `wiw collect navigation` has left
+    $ wiw train warpnet --data data --out warpnet.safetensors  # what `wiw collect navigation` made
     $ wiw run imagenav --world-model warpnet --world-model-option weights=warpnet.safetensors
 
     Walks through the scenes are rendered and cached first, so that an interrupted command does not render them again.
     Training takes 15 to 30 minutes on two idle cores. FILE also holds the recipe, and PSNR and SSIM on the val scenes,
     next to copy and warp. The weights shipped with wiw were trained by this command with its defaults.
 
-    With --data, it trains on the clips of a dataset instead, in their order of post-training: validated on scenes that
-    are left out, resumed exactly when the command is repeated, and with a log beside FILE.
+    With --data, it trains on the clips of a dataset instead, in the order that post-training uses: validated on scenes
+    that are left out, resumed exactly when the command is repeated, and with a log beside FILE.
 
     Args:
         out: File for the weights (safetensors).

@@ -13,8 +13,8 @@ from numpy.typing import NDArray
 from wiw.errors import ArgumentError
 from wiw.networks import single_thread
 from wiw.types import Conditioning, Control
-from wiw.world_models.base import Accepts, accepts
-from wiw.world_models.trained import Trained, require_size
+from wiw.world_models.base import accepts
+from wiw.world_models.trained import Trained
 from wiw.world_models.warpnet.model import STILL, shrink_panorama, to_network, turn_panorama
 
 if TYPE_CHECKING:
@@ -25,10 +25,6 @@ if TYPE_CHECKING:
 BUILT_IN = Path(__file__).with_name("weights.safetensors")
 STEPS = 1
 """Steps of the sampler, unless the user says otherwise."""
-
-
-def _accepts(size: tuple[int, int] | None = None) -> Accepts:
-    return accepts(control="trajectory", view="panorama", size=size, best_batch=16, cacheable=True)
 
 
 class Pocket(Trained):
@@ -52,8 +48,7 @@ class Pocket(Trained):
     """
 
     steps = STEPS
-    accepts = _accepts()
-    size: tuple[int, int] | None = None
+    accepts = accepts(control="trajectory", view="panorama", best_batch=16, cacheable=True)
 
     def __init__(
         self, weights: str | Path | None = None, steps: int = STEPS, size: tuple[int, int] | None = None
@@ -63,8 +58,7 @@ class Pocket(Trained):
         super().__init__(weights)
         self.steps = steps
         if size is not None:
-            require_size("pocket", size, self._network.size)
-            self.size, self.accepts = size, _accepts(size)
+            self.choose_size(size)
 
     @staticmethod
     def _load(weights: str | Path | None) -> tuple[Denoiser, dict[str, Any]]:
@@ -74,7 +68,7 @@ class Pocket(Trained):
 
     def describe(self) -> dict[str, Any]:
         """Return the weights' file, a digest of them, steps, torch's version, and the size if one was chosen."""
-        return {**super().describe(), "steps": self.steps} | ({} if self.size is None else {"size": list(self.size)})
+        return {**super().describe(), "steps": self.steps}
 
     def rollout(
         self, observations: Conditioning, controls: Sequence[Control], seeds: NDArray[np.uint64]

@@ -13,8 +13,8 @@ from numpy.typing import NDArray
 
 from wiw.networks import single_thread
 from wiw.types import Conditioning, Control
-from wiw.world_models.base import Accepts, accepts
-from wiw.world_models.trained import Trained, require_size
+from wiw.world_models.base import accepts
+from wiw.world_models.trained import Trained
 
 if TYPE_CHECKING:
     from wiw.world_models.warpnet.network import Network
@@ -22,12 +22,6 @@ if TYPE_CHECKING:
 BUILT_IN = Path(__file__).with_name("weights.safetensors")
 STILL = 1e-4
 """Metres: who has moved less stands where it stood."""
-
-
-def _accepts(size: tuple[int, int] | None = None) -> Accepts:
-    return accepts(
-        control="trajectory", view="panorama", size=size, causal=True, best_batch=16, cacheable=True, seeded=False
-    )
 
 
 class WarpNet(Trained):
@@ -48,18 +42,12 @@ class WarpNet(Trained):
         WeightsError: no such file, damaged, or of another version.
     """
 
-    accepts = _accepts()
-    size: tuple[int, int] | None = None
+    accepts = accepts(control="trajectory", view="panorama", causal=True, best_batch=16, cacheable=True, seeded=False)
 
     def __init__(self, weights: str | Path | None = None, size: tuple[int, int] | None = None) -> None:
         super().__init__(weights)
         if size is not None:
-            require_size("warpnet", size, self._network.size)
-            self.size, self.accepts = size, _accepts(size)
-
-    def describe(self) -> dict[str, Any]:
-        """Return the weights' file, a digest of them, torch's version, and the size if one was chosen."""
-        return super().describe() | ({} if self.size is None else {"size": list(self.size)})
+            self.choose_size(size)
 
     @staticmethod
     def _load(weights: str | Path | None) -> tuple[Network, dict[str, Any]]:
