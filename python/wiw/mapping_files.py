@@ -11,6 +11,10 @@ from typing import Any
 from wiw.errors import FileError
 from wiw.json_text import parse_json
 
+TOO_DEEP = "expected less deeply nested lists and mappings"
+MOST_BRACKETS = 100
+"""Open at once in a YAML file; PyYAML looks at all of them for each word, which takes seconds from a thousand on."""
+
 
 def read_yaml_mapping(path: Path, expected: str) -> dict[str, Any]:
     """Return the mapping in a YAML file.
@@ -43,14 +47,24 @@ def parse_yaml(text: str) -> Any:
     try:
         return deepcopy(_parse_yaml_once(text))
     except RecursionError:
-        raise ValueError("expected less deeply nested lists and mappings") from None
+        raise ValueError(TOO_DEEP) from None
 
 
 @lru_cache(maxsize=64)  # every task reads its presets anew, and parsing takes longer than all else that makes a task
 def _parse_yaml_once(text: str) -> Any:
     import yaml
 
-    return yaml.safe_load(text)
+    class ShallowLoader(yaml.SafeLoader):
+        def fetch_flow_collection_start(self, TokenClass: type) -> None:
+            if self.flow_level == MOST_BRACKETS:
+                raise ValueError(TOO_DEEP)
+            super().fetch_flow_collection_start(TokenClass)
+
+    loader = ShallowLoader(text)
+    try:
+        return loader.get_single_data()
+    finally:
+        loader.dispose()
 
 
 def read_json_object(path: Path, expected: str) -> dict[str, Any]:

@@ -17,11 +17,11 @@ from typing import Any
 
 import msgpack
 import numpy as np
-import yaml
 
 import wiw
 from wiw import _core
 from wiw.errors import Error
+from wiw.mapping_files import parse_yaml
 
 Read = Callable[[bytes, Path], Any]
 """Reads bytes, for which it may use a folder."""
@@ -61,7 +61,7 @@ def damage_json(data: bytes, draw: random.Random) -> bytes:
 
 
 def damage_yaml(data: bytes, draw: random.Random) -> bytes:
-    return damage_json(json.dumps(yaml.safe_load(data)).encode(), draw)  # JSON is YAML
+    return damage_json(json.dumps(parse_yaml(data.decode())).encode(), draw)  # JSON is YAML
 
 
 def damage_msgpack(data: bytes, draw: random.Random) -> bytes:

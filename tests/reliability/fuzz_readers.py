@@ -45,7 +45,7 @@ def fuzz(name: str, folder: Path, options: list[str]) -> None:
     reader = READERS[name]
     sample = reader.make_sample(folder)
     reader.read(sample, folder)  # imports what it needs
-    instrument("wiw", "json", "yaml", "gzip")
+    instrument("wiw", "json", "gzip")
     corpus = folder / "corpus"
     corpus.mkdir()
     (corpus / "sample").write_bytes(sample)

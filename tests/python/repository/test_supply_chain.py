@@ -19,8 +19,11 @@ PERMISSIVE = {
 }  # fmt: skip
 WEAK_COPYLEFT = {"MPL-2.0", "Mozilla Public License 2.0 (MPL 2.0)"}
 """Asks for the source of its own files alone, which wiw neither changes nor ships."""
-KNOWN = {"embreex": "Copyright (c) 2015, Anthony Scopatz"}
-"""Packages whose metadata quotes a licence in place of its name: by the first line of it, here of BSD-2-Clause."""
+KNOWN = {
+    "embreex": "Copyright (c) 2015, Anthony Scopatz",  # BSD-2-Clause
+    "atheris": "",  # Apache-2.0, in a file alone
+}
+"""Packages whose metadata quotes a licence in place of its name, by its first line, or do not name any."""
 
 
 def read_licences(package: Distribution) -> set[str]:

@@ -12,7 +12,7 @@ from locations import ROOT
 import wiw
 from wiw.cli import main
 from wiw.errors import ArgumentError, FileError, StoreError
-from wiw.mapping_files import read_yaml_mapping
+from wiw.mapping_files import MOST_BRACKETS, parse_yaml, read_yaml_mapping
 from wiw.runs.recipes import AgentRecipe
 from wiw.studies.evaluate import evaluate, resume_run
 from wiw.tasks import presets
@@ -52,6 +52,14 @@ def test_what_a_reader_changes_is_not_what_the_next_one_reads(tmp_path: Path) ->
     assert read_yaml_mapping(own, "rules") == {"generator": {"near": 1}}
     write_preset(tmp_path, "generator: {near: 3}")
     assert read_yaml_mapping(own, "rules") == {"generator": {"near": 3}}
+
+
+@pytest.mark.parametrize("line", ["{}", "rules: {}", "- {}"])
+def test_brackets_are_nested_so_deep_and_no_deeper(line: str) -> None:
+    """PyYAML alone takes 2.5 s to find that there is no end to 4,000 brackets."""
+    assert parse_yaml(line.format("[" * MOST_BRACKETS + "]" * MOST_BRACKETS))
+    with pytest.raises(ValueError, match="less deeply nested"):
+        parse_yaml(line.format("[" * 10**6))
 
 
 def test_they_lie_inside_the_package_and_are_shown_at_the_root() -> None:
