@@ -11,7 +11,7 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor, nn
 
-from wiw.datasets.navigation import Clips, SelectedClips
+from wiw.datasets.navigation import Clips, NavigationData, SelectedClips
 from wiw.training.post_training.clip_trainer import ClipTrainer, mix_seed, seed_torch
 from wiw.training.post_training.recipe import ClipRecipe
 from wiw.training.reduced_frames import ReducedFrames
@@ -38,6 +38,14 @@ class PlaceTrainer(ClipTrainer):
         with seed_torch(mix_seed(recipe.seed, "weights"), self.device):
             self.network = self.create_network().train()
         self.start_optimizer(dict(self.network.named_parameters()))
+
+    @classmethod
+    def check_dataset(cls, data: NavigationData) -> None:
+        """Check that a dataset has what the network learns from, before its frames are decoded.
+
+        Raises:
+            ArgumentError: it has not.
+        """
 
     @abstractmethod
     def create_network(self) -> nn.Module:

@@ -80,8 +80,9 @@ def train_on_clips(
         The card in the file: data, recipe, steps, validation and the loss at the end.
 
     Raises:
-        ArgumentError: an unknown model, a dataset of perspective views or of scenes for evaluation, too few clips, a
-            state of a training with other data or numbers, or validation on scenes that are trained on or not there.
+        ArgumentError: an unknown model; a dataset of perspective views, of scenes for evaluation or, for warpnet,
+            without depth; too few clips; a state of a training with other data or numbers; or validation on scenes
+            that are trained on or not there.
         TrainingError: the loss is not finite; the last good state is kept, the message names the batch.
         FileError: the dataset is missing or damaged, or a file cannot be written.
         DeviceMemoryError: memory does not suffice.
@@ -97,6 +98,7 @@ def train_on_clips(
     corpus = open_part(data, part)
     require_training_split(corpus)
     dataset = corpus.data
+    learner.trainer.check_dataset(dataset)
     clips = dataset.clips(recipe.frames)
     arrange_clips(len(clips), recipe)
     held_out, checked = find_held_out(open_part, corpus, validation, decisions, recipe), None

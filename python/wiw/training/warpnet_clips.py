@@ -15,7 +15,7 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from wiw.datasets.navigation import Clips, SelectedClips
+from wiw.datasets.navigation import NavigationData
 from wiw.errors import ArgumentError
 from wiw.networks import has_bfloat16
 from wiw.training.held_out_panoramas import turn_panoramas
@@ -49,19 +49,22 @@ class WarpNetClipRecipe(ClipRecipe):
 
 
 class WarpNetClipTrainer(PlaceTrainer):
-    """Train warpnet from random weights, on frames with distances.
-
-    Raises:
-        ArgumentError: there are none, or see `PlaceTrainer`.
-    """
+    """Train warpnet from random weights, on frames with distances; see `PlaceTrainer`."""
 
     recipe: WarpNetClipRecipe
     network: Network
 
-    def __init__(self, clips: Clips | SelectedClips, frames: ReducedFrames, recipe: ClipRecipe) -> None:
-        if not frames.log_distances.size:
-            raise ArgumentError("warpnet learns distances, but the dataset has no depth: collect it with --depth")
-        super().__init__(clips, frames, recipe)
+    @classmethod
+    def check_dataset(cls, data: NavigationData) -> None:
+        """Check that a dataset has depth.
+
+        Raises:
+            ArgumentError: it has not.
+        """
+        if data.meta["depth"] is None:
+            raise ArgumentError(
+                f"warpnet learns distances, but the dataset has no depth: {data.folder}; collect it without --no-depth"
+            )
 
     def create_network(self) -> Network:
         """Return a network of random weights."""

@@ -4,6 +4,8 @@
 from __future__ import annotations
 
 import shutil
+from collections.abc import Mapping
+from dataclasses import replace
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -13,14 +15,17 @@ import pytest
 import yaml
 
 from wiw.cli.app import main
-from wiw.datasets.navigation import read_meta
+from wiw.datasets.navigation import NavigationData, read_meta
 from wiw.datasets.worlds import world
 from wiw.errors import ArgumentError, FileError
 from wiw.training.collect_navigation import collect_navigation
 
 torch = pytest.importorskip("torch", reason="needs wiw[torch]")
 
+from wiw.training.held_out_panoramas import select_panoramas  # noqa: E402
+from wiw.training.post_training.corpora import NavigationCorpus  # noqa: E402
 from wiw.training.post_training.recipe import load_recipe  # noqa: E402
+from wiw.training.post_training.validation import ValidationSet  # noqa: E402
 from wiw.training.train_on_clips import train_on_clips  # noqa: E402
 from wiw.training.walks import WalkRules, Walks, find_straight_paths, merge_walks, record_walks  # noqa: E402
 from wiw.training.warpnet import Recipe, evaluate, sample_pairs, train  # noqa: E402
@@ -151,6 +156,7 @@ def test_it_trains_on_a_dataset_and_resumes(
     if read_meta(dataset)["depth"] is None:
         assert run(tmp_path / "blind") == 2
         assert "warpnet learns distances, but the dataset has no depth" in " ".join(capsys.readouterr().err.split())
+        assert not (tmp_path / "cache").exists(), "frames were decoded first"
         return
     assert run(tmp_path / "whole") == 0
     assert "8 steps of 4 clips" in capsys.readouterr().out
@@ -162,6 +168,23 @@ def test_it_trains_on_a_dataset_and_resumes(
     whole, parts = WarpNet(tmp_path / "whole"), WarpNet(tmp_path / "parts")
     assert whole.describe()["digest"] == parts.describe()["digest"]
     assert whole.card["steps"] == 8 and set(whole.card["held_out"]["psnr"]) == {"copy", "warpnet", "warp"}
+
+
+@pytest.mark.parametrize("dataset", [True], indirect=True, ids=["depth"])
+def test_the_best_weights_in_validation_are_kept(
+    dataset: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    data = NavigationData(dataset)
+    checked = ValidationSet(select_panoramas(data.clips(8), 3, 0, (24, 48)), None, 1, {"made": "for the test"})
+    monkeypatch.setattr("wiw.training.train_on_clips.find_held_out", lambda *_: NavigationCorpus(data, "all"))
+    monkeypatch.setattr("wiw.training.train_on_clips.build_validation_set", lambda *_: checked)
+    told: dict[int, Mapping[str, Any]] = {}
+    out, options = tmp_path / "warpnet.safetensors", {"on_validation": lambda step, found: told.update({step: found})}
+    recipe = replace(clip_recipe(), validate_every=1)
+    card = train_on_clips("warpnet", dataset, out, tmp_path / "cache", recipe, "all", **options)
+    assert list(told) == list(range(9)) and len({found["psnr"] for found in told.values()}) == 9
+    assert card["steps"] == max(range(1, 9), key=lambda step: told[step]["psnr"])
+    assert WarpNet(out).card == card and card["validation"]["psnr"] == told[card["steps"]]["psnr"]
 
 
 def clip_recipe() -> WarpNetClipRecipe:
@@ -189,6 +212,7 @@ def fail_at(step: int) -> Any:
         (["--validation", "other"], "--validation has no effect on a training on walks"),
         (["--data", "d", "--places", "3"], "--places has no effect on a training on --data"),
         (["--data", "d", "--minutes", "3"], "--minutes has no effect on a training on --data"),
+        (["--data", "d", "--workers", "3"], "--workers has no effect on a training on --data"),
         (["--data", "d", "--scenes", "apartments:train:2"], "--scenes has no effect on a training on --data"),
         (["--data", "nowhere"], "nowhere"),
     ],

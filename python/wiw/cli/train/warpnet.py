@@ -68,7 +68,7 @@ def train_warpnet(
     check_counts(places=places, epochs=epochs)
     require(WarpNet.requires)
     watched = {"part": part, "validation": validation}
-    _check_source(data, scenes, places, limits, option, watched)
+    _check_source(data, scenes, places, limits, option, watched, preparation)
     with write_weights("warpnet", out):
         if data is not None:
             _train_on_data(out, data, val, epochs, limits.seed, option, watched, preparation)
@@ -94,6 +94,7 @@ def _check_source(
     limits: Limits,
     option: Sequence[str],
     watched: Mapping[str, Any],
+    preparation: Preparation,
 ) -> None:
     """Refuse options that what is trained on does not have."""
     if data is None:
@@ -104,7 +105,12 @@ def _check_source(
         }
         source = "walks; they go with --data"
     else:
-        found = {"--scenes": scenes != SCENES, "--places": places is not None, "--minutes": limits.minutes is not None}
+        found = {
+            "--scenes": scenes != SCENES,
+            "--places": places is not None,
+            "--minutes": limits.minutes is not None,
+            "--workers": preparation.workers != PREPARATION.workers,
+        }
         source = "--data, which has its own scenes and clips (--option clips=N for fewer)"
     if given := [name for name, is_given in found.items() if is_given]:
         raise ArgumentError(f"{given[0]} has no effect on a training on {source}; leave it out")
