@@ -4,14 +4,13 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from functools import lru_cache
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from wiw.errors import ArgumentError
-from wiw.panorama import PerspectivePlan, distance_to_planar
+from wiw.panorama import distance_to_planar, to_perspective
 
 VIEW_NAMES = ("front", "left", "right", "back")
 VIEW_YAWS_DEG = (0.0, 90.0, -90.0, 180.0)
@@ -74,14 +73,12 @@ def cut_images(
     panorama: NDArray[np.uint8], size: tuple[int, int] = SIZE, hfov_deg: float = HFOV_DEG
 ) -> NDArray[np.uint8]:
     """Cut the four views out of a panorama uint8 [H, W, 3]: [4, h, w, 3]."""
-    plan = _get_plan((panorama.shape[0], panorama.shape[1]), size, hfov_deg)
-    return plan(panorama, VIEW_YAWS_DEG)
+    return to_perspective(panorama, hfov_deg, size, VIEW_YAWS_DEG)
 
 
 def cut_labels(values: NDArray[Any], size: tuple[int, int] = SIZE, hfov_deg: float = HFOV_DEG) -> NDArray[Any]:
     """Cut the four views out of a panorama [H, W] of ids, labels or distances, none of them interpolated: [4, h, w]."""
-    plan = _get_plan((values.shape[0], values.shape[1]), size, hfov_deg)
-    return plan(values[..., None], VIEW_YAWS_DEG, interpolation="nearest")[..., 0]
+    return to_perspective(values[..., None], hfov_deg, size, VIEW_YAWS_DEG, interpolation="nearest")[..., 0]
 
 
 def place_cameras(odometry: NDArray[np.float64]) -> NDArray[np.float64]:
@@ -139,8 +136,3 @@ def check_panorama(depth: NDArray[np.float32], odometry: NDArray[np.float64]) ->
         raise ArgumentError(f"expected depth float32 [H, W] of a panorama, got {depth.dtype} {list(depth.shape)}")
     if odometry.shape != (3,) or not np.isfinite(odometry).all():
         raise ArgumentError(f"expected odometry float64 [3] (x, y, azimuth), all finite, got {odometry}")
-
-
-@lru_cache(maxsize=8)
-def _get_plan(pano_size: tuple[int, int], size: tuple[int, int], hfov_deg: float) -> PerspectivePlan:
-    return PerspectivePlan(pano_size, size, hfov_deg)

@@ -5,14 +5,13 @@ from __future__ import annotations
 
 from abc import abstractmethod
 from collections.abc import Sequence
-from functools import lru_cache
 
 import cv2
 import numpy as np
 from numpy.typing import NDArray
 
 from wiw.action import ActionSpace
-from wiw.panorama import PerspectivePlan, rotate
+from wiw.panorama import rotate, to_perspective
 from wiw.perception.boxes import box_width, find_box
 from wiw.perception.tracking import FRONT_HFOV, Tracker, get_target
 from wiw.types import Observation
@@ -81,11 +80,11 @@ class FrameTracker(Tracker):
     def _follow_front_views(
         self, observation: Observation, yaws: Sequence[float], frames: NDArray[np.uint8]
     ) -> NDArray[np.bool_]:
-        plan = _get_plan(observation.panorama.shape[:2], frames.shape[1:3])
+        size = (frames.shape[1], frames.shape[2])
         mask = get_target(observation).mask.astype(np.uint8)
 
         def cut_mask(yaw: float) -> NDArray[np.bool_]:
-            return np.asarray(plan(mask, yaw, interpolation="nearest")) > 0
+            return np.asarray(to_perspective(mask, FRONT_HFOV, size, yaw, interpolation="nearest")) > 0
 
         known, imagined = np.stack([cut_mask(yaw) for yaw in yaws]), frames[len(yaws) - 1 :]
         if not len(imagined):
@@ -94,7 +93,7 @@ class FrameTracker(Tracker):
         masks = np.stack([cut_mask(yaw) for yaw in lead])
         if not masks[0].any():  # too high, too low or too small for any front view
             return np.concatenate([known[1:], np.zeros(imagined.shape[:3], bool)])
-        views = np.stack([plan(observation.panorama, yaw) for yaw in lead])
+        views = to_perspective(observation.panorama, FRONT_HFOV, size, lead)
         return np.concatenate([known[1:], self.follow(views, masks, imagined)])
 
 
@@ -131,8 +130,3 @@ def _resize_mask(mask: NDArray[np.bool_], size: Sequence[int]) -> NDArray[np.boo
     if mask.shape == tuple(size):
         return mask
     return np.asarray(cv2.resize(mask.astype(np.uint8), (size[1], size[0]), interpolation=cv2.INTER_NEAREST)) > 0
-
-
-@lru_cache(maxsize=16)
-def _get_plan(pano_size: tuple[int, int], size: tuple[int, int]) -> PerspectivePlan:
-    return PerspectivePlan(pano_size, size, FRONT_HFOV)

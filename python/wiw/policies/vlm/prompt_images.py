@@ -4,14 +4,13 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from functools import cache
 
 import cv2
 import numpy as np
 from numpy.typing import NDArray
 
 from wiw import annotate
-from wiw.panorama import PerspectivePlan
+from wiw.panorama import to_perspective
 from wiw.perception.boxes import find_box
 from wiw.perception.tracking import Track
 from wiw.perception.views import cut_target_views
@@ -94,14 +93,8 @@ def _cut_front_views(rollout: Rollout, track: Track | None) -> tuple[Image, NDAr
     masks = None if track is None else track.masks
     if rollout.view != "panorama":
         return rollout.frames, masks
-    plan = _get_plan(rollout.frames.shape[1:3])
-    fronts = np.asarray(plan(rollout.frames, 0.0))
+    fronts = to_perspective(rollout.frames, 90.0, (VIEW, VIEW))
     if masks is None:
         return fronts, None
-    moved = plan(masks[..., None].astype(np.uint8), 0.0, interpolation="nearest")
-    return fronts, np.asarray(moved)[..., 0] > 0
-
-
-@cache
-def _get_plan(size: tuple[int, int]) -> PerspectivePlan:
-    return PerspectivePlan(size, (VIEW, VIEW), 90.0)
+    moved = to_perspective(masks[..., None].astype(np.uint8), 90.0, (VIEW, VIEW), interpolation="nearest")
+    return fronts, moved[..., 0] > 0
