@@ -80,7 +80,7 @@ def submit(
     prepared = prepare_run(task, parts, arms, rules, search, replace(config, salt=_find_salt(config)))
     folder, count = Path(prepared.settings.out or ""), prepared.count
     Shard(1, shards).select(count)
-    serving = _write_servers(folder, parts, config.servers, jobs.cluster)
+    serving = _write_servers(folder, prepared, parts.world_model, jobs.cluster)
     if serving:
         parts, arms = (
             replace(parts, world_model=_name_servers(folder), world_model_option=()),
@@ -179,19 +179,23 @@ def _explain_unknown(job: SubmittedJob, folder: Path) -> str:
     return f"; if this does not change and the jobs have ended (see squeue), remove {folder / FILE_NAME}"
 
 
-def _write_servers(folder: Path, parts: AgentFlags, count: int, cluster: str) -> list[list[str]]:
-    """Return the commands of servers of the world model.
+def _write_servers(folder: Path, prepared: PreparedRun, model: str, cluster: str) -> list[list[str]]:
+    """Return the commands of servers of the world model, with the options that the run gives it.
 
     Raises:
-        ArgumentError: there is no world model.
+        ArgumentError: there is no world model, no arm has it, or arms have it with different options.
     """
-    if count and parts.world_model == "none":
+    from wiw.runs.servers import write_commands
+
+    if not prepared.settings.servers:
+        return []
+    if model == "none":
         raise ArgumentError("submit: --servers serve --world-model, but none is given; name one or omit --servers")
-    options = [part for option in parts.world_model_option for part in ("--world-model-option", option)]
     listen = ["--host", "127.0.0.1" if cluster == "local" else "0.0.0.0", "--port", "0", "--idle", IDLE]
     return [
-        ["serve", parts.world_model, *options, *listen, "--announce", str(folder / SERVERS / f"{number}.json")]
-        for number in range(1, count + 1)
+        [*command.arguments, *listen, "--announce", str(folder / SERVERS / f"{number}.json")]
+        for command in write_commands(prepared.built, prepared.recipes, replace(prepared.settings, served=model))
+        for number in range(1, command.count + 1)
     ]
 
 

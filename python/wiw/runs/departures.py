@@ -179,6 +179,12 @@ def _compare_model(task: Task, recipe: AgentRecipe) -> Iterator[Departure]:
     for name, value in recipe.model_options.items():
         if name in theirs and name != "weights" and to_json(value) != to_json(theirs[name]):
             yield Departure(f"{recipe.model} {name}", f"{value} (preset: {theirs[name]})")
+    if str(recipe.model).startswith("remote:") and task.model_options:
+        topic, reason = (
+            "options of a served world model",
+            "they are its server's; whether they are the preset's is unknown",
+        )
+        yield Departure(topic, "", reason)
     if recipe.imagine_fraction not in (None, 1):
         yield Departure("decisions with a world model", f"a share of {recipe.imagine_fraction} (paper: all)")
 

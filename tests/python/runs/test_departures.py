@@ -230,6 +230,12 @@ def test_settings_of_models_that_a_preset_names_count() -> None:
     assert found["decisions with a world model"] == "a share of 0.5 (paper: all)"
 
 
+def test_nobody_knows_whether_a_served_model_has_the_presets_options() -> None:
+    served, said = "remote:ws://localhost:1", "options of a served world model"
+    assert said in find_topics(ImageNav("apartments:val", preset="official"), model=served)
+    assert said not in find_topics(ImageNav("apartments:val"), model=served), "there are none"
+
+
 def test_fewer_episodes_than_the_papers_are_a_departure(tmp_path: Path, two_rooms: str) -> None:
     file = tmp_path / "val.json.gz"
     assert main(["episodes", "imagenav", "--scenes", two_rooms, "--episodes", "2", "--out", str(file)]) == 0

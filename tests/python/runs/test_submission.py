@@ -205,6 +205,17 @@ def test_servers_are_jobs_that_all_shards_ask(tmp_path, two_rooms, capsys):
         submit(tmp_path / "other", "--servers", 1, "--debug")
 
 
+def test_servers_are_given_the_options_of_the_preset(tmp_path, capsys):
+    pytest.importorskip("diffusers", reason="needs wiw[diffusers]")
+    asked = ["imagenav", "--preset", "official", "--policy", "heuristic", "--revision", "matcher"]
+    asked += ["--world-model", "svd", "--world-model-option", "motion=90", "--arms", "none,svd", "--servers", "2"]
+    assert main(["submit", *asked, "--shards", "1", "--dry-run", "--out", str(tmp_path / "run")]) == 0
+    lines = [shlex.split(line)[1:] for line in capsys.readouterr().out.splitlines() if line.startswith("wiw serve ")]
+    assert [line[1] for line in lines] == ["svd", "svd"]
+    assert {"steps=30", "frames=14", "motion=90"} <= set(lines[0])
+    assert not [part for part in lines[0] if part.startswith("space=")], "none for plans of primitives"
+
+
 SBATCH = """
 import os, re, subprocess, sys
 script = sys.argv[1]
