@@ -241,6 +241,8 @@ class Goal:
     """The possible answers, if the task asks for a choice."""
     question: bool = False
     """Whether `text` is a question to be answered in words (`TextAnswer`)."""
+    budget: int | None = None
+    """Most primitives of the episode; None where the agent is not told."""
 
     @property
     def expects_answer(self) -> bool:

@@ -393,9 +393,10 @@ def test_episodes_do_not_depend_on_what_else_is_live(episode):  # noqa: F811
     }
 
 
-def test_time_that_is_nearly_up_makes_any_belief_final(episode):  # noqa: F811
-    policy = make_explorer(budget=20, sure=1.1)
-    task = make_task(episode, actions=20)
+@pytest.mark.parametrize(("budget", "actions"), [(None, 20), (20, 45)], ids=["the task's", "its own"])
+def test_time_that_is_nearly_up_makes_any_belief_final(episode, budget, actions):  # noqa: F811
+    policy = make_explorer(budget=budget, sure=1.1)
+    task = make_task(episode, actions=actions)
     sink = Records()
     run_episodes(task, wiw.Agent(policy, **task.defaults), [(0, episode)], seed=0, live=1, sink=sink)
     assert [each.final for each in sink.answers[:1]] == [False] and sink.answers[-1].final

@@ -213,7 +213,7 @@ def knows(thing: Any) -> bool:
     return CANARY.encode() in held or any(number in held for number in numbers)
 
 
-def test_the_goal_is_the_text_alone(marked):
+def test_the_goal_is_the_text_and_the_budget_alone(marked):
     """No hidden field of a question reaches a policy."""
     seen: list[Any] = []
 
@@ -229,7 +229,7 @@ def test_the_goal_is_the_text_alone(marked):
         and knows({"deep": [Question.from_info(marked.info["question"])]})
     )
     run(make_task(marked, actions=30), Spy(final()), [marked])
-    assert seen and all(each.goal == Goal("aeqa", text=QUESTION.text, question=True) for each in seen)
+    assert seen and all(each.goal == Goal("aeqa", text=QUESTION.text, question=True, budget=30) for each in seen)
     assert not any(knows((each.goal, each.key, each.memory, each.executed)) for each in seen)
     assert not any(CANARY in repr(vars(each.observation)) for each in seen)
 

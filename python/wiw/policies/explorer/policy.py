@@ -58,7 +58,8 @@ class Explorer(Policy):
         imagination: weight of what imagined views show, in the units of a destination's worth (square metres).
         path: worth of a metre that need not be walked, in square metres of new floor.
         affinity: worth of a room that is likely to have what is asked about.
-        budget: primitives of an episode; with its last segment the agent answers, whatever its confidence.
+        budget: primitives of an episode; with its last segment the agent answers, whatever its confidence. None: the
+            task's.
 
     Raises:
         ArgumentError: a labeller that needs the simulator's instance ids.
@@ -76,7 +77,7 @@ class Explorer(Policy):
         imagination: float = 8.0,
         path: float = 2.0,
         affinity: float = 6.0,
-        budget: int = 250,
+        budget: int | None = None,
         calibrated: bool = True,
     ) -> None:
         self.labeller: Labeller = LABELLERS.make(perception)
@@ -281,8 +282,9 @@ class Explorer(Policy):
     def is_final(self, situation: Situation) -> bool:
         """Return whether the present belief is the answer: it is sure enough, nothing is left to see, or no time."""
         memory = situation.memory
-        left = self.budget - len(situation.executed)
-        return bool(memory.belief.confidence >= self.sure or not memory.destinations or left <= LAST_ACTIONS)
+        budget = situation.goal.budget if self.budget is None else self.budget
+        is_ending = budget is not None and budget - len(situation.executed) <= LAST_ACTIONS
+        return bool(memory.belief.confidence >= self.sure or not memory.destinations or is_ending)
 
 
 def _find_patches(mask: NDArray[np.bool_]) -> tuple[NDArray[np.intp], NDArray[np.intp], NDArray[np.intp]]:
