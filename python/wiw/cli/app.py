@@ -54,7 +54,7 @@ DESCRIPTION = """Does a world model help an agent succeed, and by how much?
 An agent uses a world model to imagine the outcome of each candidate plan, picks one plan and acts. `wiw run` does this
 on a task, for one world model or several on the same episodes, and measures how much each raises task success.
 
-  $ wiw demo                                              five world models side by side, in a few minutes
+  $ wiw demo                                              four tasks, two to five world models each, in minutes
   $ wiw list                                              world models, policies, tasks, metrics, presets
   $ wiw run imagenav --world-model warp --episodes 50     one world model
   $ wiw check-model my_model.py:MyModel                   does your own model work?

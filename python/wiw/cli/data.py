@@ -19,7 +19,7 @@ Folder = Positional[Annotated[Path, arg(metavar="DIR")]]
 
 
 def verify_data(
-    folders: Positional[Annotated[tuple[Path, ...], arg(metavar="DIR...")]],
+    folders: Positional[Annotated[tuple[Path, ...], arg(metavar="DIR...", help_behavior_hint="(required)")]],
     /,
     *,
     quick: bool = False,

@@ -10,7 +10,7 @@ from tyro.conf import Positional, arg
 
 
 def merge(
-    stores: Positional[Annotated[tuple[Path, ...], arg(metavar="STORE [STORE ...]")]],
+    stores: Positional[Annotated[tuple[Path, ...], arg(metavar="STORE [STORE ...]", help_behavior_hint="(required)")]],
     /,
     *,
     out: Annotated[Path, arg(metavar="RUN")],

@@ -46,7 +46,8 @@ class TaskFlags:
     """For manipulation: description of the robot arm. Default: the Franka Panda, in simple shapes."""
     preset: Annotated[str | None, arg(metavar="NAME|FILE")] = None
     """All settings that scores depend on: default, paper, official (the paper's published code), foresight (for ar and
-    imagenav), or your own YAML file. The command line takes precedence. See `wiw list presets`."""
+    imagenav), paper-diffusion (for manipulation), or your own YAML file. The command line takes precedence. See
+    `wiw list presets`."""
     task_option: Options = ()
     """A rule of the preset, such as decisions=10, or another option of the task, such as categories=bed,sofa; may be
     repeated."""
@@ -82,7 +83,8 @@ class AgentFlags:
     model in the run's process."""
     policy: MaybeName = None
     """Policy that proposes plans: name, path.py:Class, or isolated:path.py:Class to run it in a separate process.
-    Default: the task's (matcher; for ar recogniser, for manipulation scripted)."""
+    Default: the task's (matcher, or navigator with preset foresight; for ar recogniser, for aeqa explorer, for
+    manipulation scripted)."""
     policy_option: Options = ()
     """An option of --policy, such as weights=FILE; may be repeated. It also applies to privileged counterparts in
     --arms."""
@@ -92,7 +94,7 @@ class AgentFlags:
     """An option of --revision; may be repeated."""
     tracker: MaybeName = None
     """For ar: tracker that finds the target in imagined frames, such as sam2 or reprojection. See `wiw list trackers`.
-    Default: frames for policy vlm, reprojection for recogniser."""
+    Default: frames for policy vlm; reprojection for recogniser, or growing with preset foresight."""
     tracker_option: Options = ()
     """An option of --tracker, such as weights=FOLDER for sam2; may be repeated."""
     vlm: Annotated[str | None, arg(metavar="URL")] = None

@@ -12,7 +12,7 @@ from wiw.ray_cluster import HERE, Engine
 
 
 def quality(
-    runs: Positional[Annotated[tuple[Path, ...], arg(metavar="RUN [RUN ...]")]],
+    runs: Positional[Annotated[tuple[Path, ...], arg(metavar="RUN [RUN ...]", help_behavior_hint="(required)")]],
     /,
     *,
     scorer: Annotated[tuple[str, ...], UseAppendAction, arg(metavar="COMMAND|laion")] = (),

@@ -12,8 +12,10 @@ from tyro.conf import Positional, arg
 from wiw.cli.terminal import printable
 from wiw.errors import ArgumentError
 
+Runs = Annotated[tuple[Path, ...], arg(metavar="RUN [RUN ...]", help_behavior_hint="(required)")]
 
-def status(runs: Positional[Annotated[tuple[Path, ...], arg(metavar="RUN [RUN ...]")]], /) -> int:
+
+def status(runs: Positional[Runs], /) -> int:
     """Show the progress of runs: shards, finished episodes, errors, time left. Read-only, so safe during a run.
 
     $ wiw status runs/first

@@ -31,8 +31,8 @@ def study_data_scaling(
 
     $ wiw study data-scaling --small --workers 2               # collects its own data; under an hour on two cores
     $ wiw collect navigation --scenes apartments:train:80 --out data --workers 4
-    $ wiw study data-scaling --data data --workers 4           # 128 to 12,800 clips in 64x128; hours
-    $ wiw study data-scaling --data data --models warpnet --seeds 0,1,2 --imagenav 100
+    $ wiw study data-scaling --data data --workers 4 --out runs/full    # 128 to 12,800 clips in 64x128; hours
+    $ wiw study data-scaling --data data --models warpnet --seeds 0,1,2 --imagenav 100 --out runs/warpnet
 
     The paper trains on more and more clips for one epoch each, so more clips also mean more updates. Three arms
     separate the two: one epoch, as in the paper; every size for as many updates as the largest; and the same number of

@@ -98,13 +98,13 @@ def _paint_colors(instances: Sequence[Mapping[str, Any]]) -> NDArray[np.uint8]:
 
 
 class OracleExplorer(PrivilegedExplorer):
-    """Explores like `Explorer`, but with true labels."""
+    """Explores like `explorer`, but with true labels."""
 
     true_labels = True
 
 
 class TourExplorer(PrivilegedExplorer):
-    """Gets a tour of the whole home, and labels it like `Explorer`."""
+    """Gets a tour of the whole home, and labels it like `explorer`."""
 
     tour = True
 

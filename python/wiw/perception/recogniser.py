@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
-from wiw.errors import ArgumentError, BackendError, FileError
+from wiw.errors import ArgumentError, DependencyError, FileError
 from wiw.files import atomic_file
 from wiw.networks import single_thread
 from wiw.perception.calibration import softmax
@@ -58,7 +58,7 @@ class Recogniser:
         """Load a recogniser from its file.
 
         Raises:
-            BackendError: torch or safetensors is not installed.
+            DependencyError: torch or safetensors is not installed.
             FileError: there is no such file, or it is damaged or of another format.
         """
         require_torch()
@@ -161,12 +161,16 @@ class Recogniser:
 
 
 def require_torch() -> None:
-    """Raise a BackendError that says how to install torch and safetensors, unless they are installed."""
+    """Check that torch and safetensors are installed.
+
+    Raises:
+        DependencyError: saying how to install them.
+    """
     try:
         import safetensors  # noqa: F401
         import torch  # noqa: F401
     except ImportError as error:
-        raise BackendError(
+        raise DependencyError(
             f"the recogniser needs torch and safetensors ({error}): pip install 'wiw[torch]', or for CPU only pip "
             "install torch safetensors --extra-index-url https://download.pytorch.org/whl/cpu"
         ) from error

@@ -36,8 +36,9 @@ class Limits:
     """Time in seconds without news from a worker process or Ray actor, such as a decision, after which it is stopped as
     hung, and its episodes begin again; more than a model takes to load. Default: 2 hours, or 24 times --deadline."""
     cache: Annotated[str | Path, arg(metavar="auto|off|DIR")] = "auto"
-    """Where rollouts are cached, so that a model never computes the same one twice: auto (in ~/.cache/wiw/rollouts, for
-    models that declare themselves cacheable), a folder (for every model), or off."""
+    """Where rollouts are cached, so that a model never computes the same one twice: auto (~/.cache/wiw/rollouts, or
+    $WIW_CACHE/rollouts, for models that declare themselves cacheable), a folder (for all that have a version, but never
+    the oracle), or off."""
     cache_gb: Annotated[float, arg(metavar="N")] = BUDGET_GB
     """Maximum size of that folder in gigabytes; the least recently used rollouts are dropped first."""
     fidelity: bool = False
@@ -46,8 +47,8 @@ class Limits:
     fidelity_share: Annotated[float, arg(metavar="SHARE")] = 1.0
     """Share of the decisions, sampled by their keys, at which fidelity is measured."""
     lpips: Annotated[str | Path | None, arg(metavar="auto|DIR")] = None
-    """Folder with the weights of LPIPS, to measure fidelity with it as well (auto: ~/.cache/wiw/weights). If they are
-    missing, the error says which files are needed."""
+    """Folder with the weights of LPIPS, to measure fidelity with it as well (auto: ~/.cache/wiw/weights, or
+    $WIW_CACHE/weights). If they are missing, the error says which files are needed."""
 
     def __post_init__(self) -> None:
         for name in ("deadline", "stall", "cache_gb"):

@@ -31,7 +31,7 @@ class NavigationTask(NavigationSpec, Task):
         scenes: scene spec, e.g. "apartments:test:40", or the path of a mesh or SDF world; None: "apartments:val". If
             Habitat's navigation mesh is beside it ("house.navmesh" for "house.glb"), that one is used.
         seed: seed of the generated episodes and of the run.
-        preset: "default", "paper", "official", or the path of a YAML file; `rules` overrides it field by field.
+        preset: "default", "paper", "official", "foresight", or the path of a YAML file; `rules` overrides its fields.
         episode_file: a JSON episode file to use instead of generating; habitat-lab's and World-in-World's are read too.
         scene_folder: folder that scene paths in an episode file are relative to; if not given, the folder of a file of
             wiw, else the present one.

@@ -54,7 +54,8 @@ class Request:
     max_tokens: int = 1024
     """Maximum number of tokens of an answer that is not a choice."""
     tries: int = 3
-    """Times that it is asked before an unusable answer counts as the outcome."""
+    """Times that it is asked for text or JSON before an unusable answer counts as the outcome. For a choice the votes
+    are all that is asked."""
 
     def __post_init__(self) -> None:
         if self.choices and self.schema is not None:

@@ -14,7 +14,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from wiw.errors import ArgumentError, BackendError, FileError
+from wiw.errors import ArgumentError, DependencyError, FileError
 from wiw.panorama import directions
 from wiw.perception.calibration import calibration_error, fit_temperature, softmax
 from wiw.perception.glimpses import CLOSE_FILL, SIDE, STEP, WIDE_FACTOR, Glimpses, extract_glimpses, join_glimpses
@@ -241,7 +241,7 @@ def test_without_torch_it_says_how_to_get_it(monkeypatch: pytest.MonkeyPatch, tm
     from wiw.perception.recogniser import Recogniser
 
     monkeypatch.setitem(sys.modules, "torch", None)
-    with pytest.raises(BackendError, match=r"pip install 'wiw\[torch\]'"):
+    with pytest.raises(DependencyError, match=r"pip install 'wiw\[torch\]'"):
         Recogniser.load(tmp_path / "weights.safetensors")
 
 

@@ -36,6 +36,8 @@ VIDEO: Mapping[str, str] = {
 """Pretrained models that can be post-trained to follow actions: titles by name."""
 RUN_AS: Mapping[str, str] = {"nwm-action": "nwm"}
 """World models whose name differs from the name they are trained under."""
+GIVEN_AS: Mapping[str, str] = {"nwm-action": "weights"}
+"""Options by which they take the checkpoint, where it is not `checkpoint`."""
 ALSO_ARM = " or `wiw collect manipulation`"
 ONE_PROCESS = ProcessLayout()
 
@@ -76,7 +78,10 @@ def make_command(name: str) -> Callable[..., int]:
         return _post_train(name, out or Path(name), data, recipe, option, numbers, parts, layout, dry_run)
 
     train_video.__doc__ = (
-        HELP.replace("TITLE", VIDEO[name]).replace("NAME", name).replace("RUN", RUN_AS.get(name, name))
+        HELP.replace("TITLE", VIDEO[name])
+        .replace("NAME", name)
+        .replace("RUN", RUN_AS.get(name, name))
+        .replace("GIVEN", GIVEN_AS.get(name, "checkpoint"))
     )
     return train_video
 
@@ -85,7 +90,7 @@ HELP = """Post-train TITLE, starting from pretrained weights, to follow actions.
 
     $ wiw collect navigation --scenes apartments:train:80 --out data
     $ wiw train NAME --data data --out runs/mine
-    $ wiw run imagenav --world-model RUN --world-model-option checkpoint=runs/mine
+    $ wiw run imagenav --world-model RUN --world-model-option GIVEN=runs/mine
     $ wiw train NAME --data data --weights /models/pretrained --option clips=1600 --out runs/short
     $ wiw train NAME --data data --gpus 8 --out runs/mine
     $ wiw train NAME --data data --option shard=true --nodes 2 --gpus 8 --partition gpu --out runs/mine
