@@ -93,6 +93,8 @@ def test_parts_share_no_demonstration(demos: Path) -> None:
     whole, trained = (open_corpus(demos, part, held_out=0.5) for part in ("all", "train"))
     assert 0 < len(trained.clips(13)) < len(whole.clips(13))
     assert trained.describe()["part"] == "train" and trained.describe()["sha256"] == whole.describe()["sha256"]
+    lighter = open_corpus(demos, "train", held_out=0.0)
+    assert len(lighter.clips(13)) == len(whole.clips(13)) and lighter.describe() != trained.describe()
     with pytest.raises(ArgumentError, match="expected demonstrations with an action in the part 'train', got none"):
         open_corpus(demos, "train", held_out=1.0).clips(13)
 

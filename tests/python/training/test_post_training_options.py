@@ -5,6 +5,7 @@ from __future__ import annotations
 
 import importlib.util
 import io
+import shutil
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -22,8 +23,11 @@ import torch
 from post_training_parts import make_trainer, save_dataset, save_stock, tiny_recipe, with_nightly
 from safetensors.torch import load_file
 
+import tiny_pipelines
+from wiw.training.post_training.corpora import open_corpus
+from wiw.training.post_training.families import PretrainedWeights, find_family
 from wiw.training.post_training.latent_cache import LatentCache
-from wiw.training.post_training.train import list_remedies, post_train
+from wiw.training.post_training.train import list_remedies, open_cache, post_train
 from wiw.training.post_training.trainer import PostTrainer
 
 pytestmark = pytest.mark.usefixtures("one_torch_thread")
@@ -141,6 +145,20 @@ def test_trainings_share_a_cache_unless_latents_differ(data: Path, weights: Any,
     assert [count(0), count(1, rate=1e-2, ema=0.5), count(2, size=(64, 64))] == [1, 1, 2]
 
 
+def test_variants_of_weights_in_one_folder_are_different_weights(data: Path, weights: Any, tmp_path: Path) -> None:
+    name, folder = "ltx-action", tmp_path / "both"
+    shutil.copytree(weights(name), folder)
+    tiny_pipelines.ltx().save_pretrained(folder, variant="fp16")
+    family = find_family(name)
+    corpus, recipe = family.fit(open_corpus(data, "all"), tiny_recipe(name))
+    plain, half = (
+        family.load(corpus, recipe, PretrainedWeights(str(folder), variant=variant, device="cpu"))
+        for variant in (None, "fp16")
+    )
+    assert "variant" not in plain.identity and half.identity == {**plain.identity, "variant": "fp16"}
+    assert open_cache(tmp_path, plain, corpus).folder != open_cache(tmp_path, half, corpus).folder
+
+
 @pytest.mark.extra
 def test_8_bit_adam_is_near_adam_and_resumes_exactly(data: Path, weights: Any) -> None:
     pytest.importorskip("bitsandbytes", reason="no bitsandbytes: pip install 'wiw[lowbit]'")
@@ -182,4 +200,4 @@ def test_remedies_name_what_is_not_yet_lowered() -> None:
     said = "; ".join(list_remedies(tiny_recipe("svd-action", ema=0.9, precision="bfloat16")))
     assert "rows=1 (now 2)" in said and "optimizer=adamw8bit" in said and "ema=0" in said and "64x128" in said
     lean = tiny_recipe("svd-action", optimizer="adamw8bit", precision="bfloat16", rows=1)
-    assert list_remedies(lean)[0].startswith("lora=32") and np.isfinite(lean.rate)
+    assert list_remedies(lean)[0] == "lora=32, for the Wan models" and np.isfinite(lean.rate)

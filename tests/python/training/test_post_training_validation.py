@@ -95,6 +95,25 @@ def test_what_is_sampled_in_training_is_what_the_checkpoint_imagines(data: Path,
     np.testing.assert_array_equal(create_sampler(trainer)(*asked), imagine_with(model)(*asked))
 
 
+@pytest.mark.parametrize("name", with_nightly(NAMES, ("svd-action", "wan2.1-action")))
+def test_in_half_precision_the_autoencoder_computes_as_in_the_world_model(name: str, data: Path, weights: Any) -> None:
+    trainer = make_trainer(name, data, weights(name), precision="bfloat16")
+    pipeline, found = trainer.model.objective.pipeline, {}
+
+    def note(network: Any, _: Any, made: Any) -> None:
+        found[network] = (made[0] if isinstance(made, tuple) else made).dtype
+
+    denoisers = [getattr(pipeline, place) for place in trainer.model.places]
+    for network in (pipeline.vae.decoder, *denoisers):
+        network.register_forward_hook(note)
+    size, last = trainer.recipe.clip_size, trainer.recipe.frames - 1
+    observations = Conditioning(np.random.default_rng(0).integers(0, 256, (1, *size, 3), np.uint8))
+    asked = np.ones((1, last), np.int8), np.zeros(1, np.uint64), np.array([[last]])
+    assert create_sampler(trainer)(observations, *asked).std() > 0
+    assert found == {pipeline.vae.decoder: pipeline.vae.dtype, **dict.fromkeys(denoisers, torch.bfloat16)}
+    assert trainer.train_step(1e-3) > 0
+
+
 def test_the_checkpoint_has_the_weights_that_were_best(train: Any, tmp_path: Path, monkeypatch: Any) -> None:
     scores = {0: 50.0, 2: 11.0, 4: 13.0, 5: 12.0}
     measured = []

@@ -482,6 +482,16 @@ def test_nan_is_no_picture(made):
     assert breach.value.kind == "nan"
 
 
+@pytest.mark.parametrize("name", NAMES)
+def test_weights_that_give_nan_are_found(name, made):
+    """Also where the pipeline makes bytes of its frames, in which NaN is black."""
+    model = made(name)
+    denoiser = getattr(model.pipeline, "transformer", None) or model.pipeline.unet
+    next(value for value in denoiser.parameters() if value.ndim > 1).data.fill_(np.nan)
+    with pytest.raises(ContractError, match="NaN in float32"):
+        rollout(model)
+
+
 @pytest.mark.parametrize("columns", [80, 120])
 def test_list_says_what_each_model_takes_and_lacks(columns, capsys, monkeypatch, tmp_path):
     monkeypatch.setenv("COLUMNS", str(columns))

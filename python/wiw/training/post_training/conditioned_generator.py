@@ -3,7 +3,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
 from copy import deepcopy
 from pathlib import Path
 from typing import Any
@@ -113,12 +114,30 @@ class ConditionedGenerator(TrainableModel):
             for rows in generator.batches(len(controls)):
                 ids = torch.from_numpy(np.stack([np.asarray(control.ids) for control in controls[rows]]))
                 actions = self._identify_actions(ids.to(self.device)).cpu().numpy()
-                with self.objective.autocast(), self._conditioning.apply(actions):
+                with self._autocast_denoisers(), self._conditioning.apply(actions):
                     clips.append(generator.make_clips(observations.image[rows], controls[rows], seeds[rows]))
         finally:
             pipeline.scheduler = scheduler
         frames = np.rint(np.concatenate(clips) * 255).astype(np.uint8)
         return frames[np.arange(len(controls))[:, None], wanted]
+
+    @contextmanager
+    def _autocast_denoisers(self) -> Iterator[None]:
+        """Let the denoisers compute in the recipe's precision, as in training, as long as the context lasts.
+
+        The other networks compute in their own: the world model runs them so, and the pipeline reads their outputs.
+        """
+        denoisers = list(map(self.find_denoiser, self.places))
+        own = [vars(each).get("forward") for each in denoisers]  # a hook's, such as of offloading
+        for each in denoisers:
+            each.forward = self.objective.autocast()(each.forward)
+        try:
+            yield
+        finally:
+            for each, forward in zip(denoisers, own, strict=True):
+                del each.forward
+                if forward is not None:
+                    each.forward = forward
 
     def select_clips(self, held_out: Corpus) -> HeldOutClips[Any]:
         """Select clips of the length that it is trained on; see `TrainableModel.select_clips`."""
@@ -173,9 +192,9 @@ def build_config(base: str, place: str, generator: VideoModel, **kind: Any) -> A
 
 
 def identify_weights(generator: VideoModel) -> dict[str, str]:
-    """Return the hub's commit of a generator's weights, or the digest of their folder."""
+    """Return the hub's commit of a generator's weights, or the digest of their folder, and their variant if any."""
     described = generator.describe()
-    return {key: str(described[key]) for key in ("commit", "digest") if key in described}
+    return {key: str(described[key]) for key in ("commit", "digest", "variant") if described.get(key) is not None}
 
 
 def prepare_denoiser(pipeline: Any, place: str, recipe: PostTrainingRecipe) -> None:

@@ -296,8 +296,9 @@ class DemonstrationCorpus(Corpus):
         return [each for each in outlines if self.part in ("all", part_of(name_demonstration(each[1]), self.held_out))]
 
     def describe(self) -> dict[str, Any]:
-        """Return a digest of the manifest, of which demonstrations are a function, and which part of them it is."""
-        return {"sha256": self.data.digest(), "part": self.part, "demonstrations": len(self.data), "view": self.view}
+        """Return a digest of the manifest, of which demonstrations are a function, which part of them, how many."""
+        count = len(self._outlines)
+        return {"sha256": self.data.digest(), "part": self.part, "demonstrations": count, "view": self.view}
 
 
 class DemonstratedPlans(Sequence[DemonstratedPlan]):

@@ -339,7 +339,7 @@ def list_remedies(recipe: PostTrainingRecipe) -> list[str]:
     eight = recipe.optimizer == "adamw" and not recipe.lora and not recipe.shard
     remedies += ["optimizer=adamw8bit"] if eight else []
     remedies += ["ema=0"] if recipe.ema else []
-    remedies += [] if recipe.lora else ["lora=32, for the Wan and LTX models"]
+    remedies += [] if recipe.lora else ["lora=32, for the Wan models"]
     return [*remedies, f"a smaller size than {height}x{width}", f"fewer frames than {recipe.frames}"]
 
 

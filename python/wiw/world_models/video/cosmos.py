@@ -12,7 +12,7 @@ from typing import Any
 from wiw.errors import ArgumentError, DependencyError
 from wiw.types import Control
 from wiw.world_models.base import accepts
-from wiw.world_models.video.model import declare_requirements
+from wiw.world_models.video.model import declare_requirements, require_no_nan
 from wiw.world_models.video.text import TextVideoModel
 
 HUB = "nvidia/Cosmos-Predict2-2B-Video2World"
@@ -50,6 +50,11 @@ class CosmosPredict2(TextVideoModel):
                 "guardrail=False (without it; the licence of the weights requires you to use your own filter)"
             )
         super().__post_init__()
+        name, precision = type(self).__name__, self.precision
+        # of the decoder's frames, as the pipeline makes bytes for the filter, in which NaN is black
+        self.pipeline.vae.decoder.register_forward_hook(
+            lambda _, __, frames: require_no_nan(bool(frames.isnan().any()), name, precision)
+        )
 
     def components(self) -> dict[str, Any]:
         """Return what takes the filter's place in the pipeline, which must not stay empty."""

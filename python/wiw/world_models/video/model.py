@@ -195,10 +195,7 @@ class VideoModel(WorldModel):
         generators = [torch.Generator("cpu").manual_seed(int(seed)) for seed in seeds]
         with loading.memory_guard(self):
             clips = self.generate([Image.fromarray(image) for image in images], controls, generators)
-        if not np.isfinite(clips).all():
-            raise ContractError(
-                f"{type(self).__name__}: the pipeline gave NaN in {self.precision}; use another precision", "nan"
-            )
+        require_no_nan(not np.isfinite(clips).all(), type(self).__name__, self.precision)
         expected = (len(images), self.frames, *self.size, 3)
         if clips.shape != expected:
             raise ContractError(f"{type(self).__name__}: expected clips {expected}, got {clips.shape}", "frames")
@@ -239,6 +236,12 @@ class VideoModel(WorldModel):
             allowed = get_args(kinds)
             if getattr(self, option) not in (None, *allowed):
                 raise ArgumentError(f"{name}: expected {option} {', '.join(allowed)}, got '{getattr(self, option)}'")
+
+
+def require_no_nan(is_found: bool, name: str, precision: Precision | None) -> None:
+    """Raise ContractError where NaN is found in what the networks of a model, named by its class, gave."""
+    if is_found:
+        raise ContractError(f"{name}: the pipeline gave NaN in {precision}; use another precision", "nan")
 
 
 def _round(pixels: int, multiple: int) -> int:
