@@ -207,7 +207,9 @@ def read_anytime_curve(done: Done, cuts: Cuts, seed: int) -> list[Breakdown]:
     return [found] if estimates else []
 
 
-def compare_anytime_curves(done: Done, pairs: Iterable[tuple[str, str]], cuts: Cuts, seed: int) -> list[Breakdown]:
+def compare_anytime_curves(
+    done: Done, pairs: Iterable[tuple[str, str]], cuts: Cuts, seed: int, anytime: bool = False
+) -> list[Breakdown]:
     """Return paired differences of the anytime curve, a table per base.
 
     Args:
@@ -215,13 +217,15 @@ def compare_anytime_curves(done: Done, pairs: Iterable[tuple[str, str]], cuts: C
         pairs: arms and what each is compared with.
         cuts: where, and which score.
         seed: of the bootstrap.
+        anytime: whether the test must hold however often the run was looked at before it was stopped.
     """
     found: dict[str, dict[tuple[str, str], Difference]] = {}
     for arm, base in pairs:
         for cut in cuts.at:
             at = cuts.make_metric(cut)
             both = [o["metrics"] for name in (arm, base) for o in done[name].values()]
-            difference = compare(arm, base, done, at, seed) if all(at.name in each for each in both) else None
+            known = all(at.name in each for each in both)
+            difference = compare(arm, base, done, at, seed, anytime) if known else None
             if difference is not None:
                 found.setdefault(base, {})[arm, str(cut)] = difference
     return [_tabulate_anytime_differences(base, cells, cuts) for base, cells in found.items()]

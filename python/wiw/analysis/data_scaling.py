@@ -209,9 +209,10 @@ class Resampled:
         self._seed_weights = rng.multinomial(seeds, np.full(seeds, 1 / seeds), RESAMPLES).astype(np.float64)
 
     def mean(self, name: str) -> Draws:
-        """Return the mean of a training over seeds, each of them pooled over scenes."""
+        """Return the mean of a training over seeds, each pooled over scenes; NaN in draws of scenes without a value."""
         sums, counts = self._sums[name], self._counts[name]
-        drawn = (self._scene_weights @ sums.T) / np.maximum(self._scene_weights @ counts.T, 1e-9)
+        drawn_counts = self._scene_weights @ counts.T
+        drawn = (self._scene_weights @ sums.T) / np.where(drawn_counts > 0, drawn_counts, np.nan)
         weights = self._seed_weights / self._seed_weights.sum(axis=1, keepdims=True)
         return Draws(float(np.mean(self.by_seed(name))), (drawn * weights).sum(axis=1))
 

@@ -20,9 +20,11 @@ from wiw.analysis.intervals import Array, Interval, Kind, p_value_of_sums, sum_b
 FEWEST_SCENES = 8
 """Scenes from which on they are flipped: with fewer, too few flips are possible for a small p."""
 MOST_ENUMERATED = 14
-"""Scenes with a difference up to which all flips are tried where the sums are not whole numbers."""
+"""Scenes with a difference up to which all flips are tried where the sums are not whole numbers, or too large."""
 DRAWS = 20_000
 """Flips that are drawn at random beyond that."""
+LARGEST_SUM = 1_000_000
+"""Sum of sizes up to which whole numbers have the probability of each sum computed; beyond it takes too much memory."""
 
 
 def find_p_value(
@@ -60,7 +62,7 @@ def flip_signs(sums: Array, seed: int = 0) -> float:
     seen = abs(float(sums.sum())) - 1e-9 * float(sizes.sum())
     if len(sizes) == 0:
         return 1.0
-    if np.array_equal(sizes, np.round(sizes)):
+    if sizes.sum() <= LARGEST_SUM and np.array_equal(sizes, np.round(sizes)):
         shares = _spread_whole_numbers(sizes.astype(int))
         far = np.abs(np.arange(len(shares)) - len(shares) // 2) >= seen
         return min(1.0, float(shares[far].sum()))

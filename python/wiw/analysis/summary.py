@@ -28,7 +28,7 @@ from wiw.analysis.noise_floor import NoiseFloor, find_repeats, measure_noise
 from wiw.analysis.statistics import LEVEL, Difference, Estimate, adjust_p_values, compare, estimate_mean
 from wiw.analysis.utility import CEILING, FLOOR, Utility, utility
 from wiw.errors import RegistryError
-from wiw.metrics.metric import ANSWER_SCORE, SPL, SPL_RULE, Metric
+from wiw.metrics.metric import ANSWER_SCORE, SPL, SPL_RULE, SUCCESS, Metric
 from wiw.registry import METRICS
 from wiw.runs.departures import Departure, read_departures
 from wiw.runs.judges import JudgeRecord
@@ -61,6 +61,9 @@ GAINS = {
 """Meaning of a difference from each of these arms."""
 BLIND_ROLE = "floor, best guess from the question's text alone"
 WORLD_MODEL, ANOTHER_POLICY = "world model", "another policy without a world model"
+
+SPAN = (CEILING, FLOOR, SUCCESS.name)
+"""Arm, base and metric of the difference that utility is a share of."""
 
 MAX_ERROR_SHARE = 0.01
 """Largest share of an arm's episodes that may end with an infrastructure error in a valid run."""
@@ -267,7 +270,7 @@ def summarise(
     beside = {**done, BLIND: blind} if blind else done
     if pairs is None:
         pairs = [(arm, base) for base in ("none", FLOOR) if base in arms for arm in arms if arm not in (base, "none")]
-    breakdowns = _break_down(beside, pairs, tables, twins, marks, seed)
+    breakdowns = _break_down(beside, pairs, tables, twins, marks, seed, anytime)
     return Summary(lines, differences, same, _list_utilities(lines, done), breakdowns, baselines, marks)
 
 
@@ -466,11 +469,12 @@ def _break_down(
     twins: Sequence[tuple[int, int]],
     marks: Marks | None,
     seed: int,
+    anytime: bool,
 ) -> tuple[Breakdown, ...]:
     known = {metric.name: _label(metric, marks) for metric in load_metrics()}
     return (
         *split_by_kind(done, [known[name] for name in tables.kinds if name in known], tables.kind, seed),
-        *_cut_episodes(done, pairs, tables, marks, seed),
+        *_cut_episodes(done, pairs, tables, marks, seed, anytime),
         *score_twins(done, twins, seed),
     )
 
@@ -481,6 +485,7 @@ def _cut_episodes(
     tables: TableSpec,
     marks: Marks | None,
     seed: int,
+    anytime: bool,
 ) -> tuple[Breakdown, ...]:
     """Return the anytime curve, over primitives where the task names cuts, else over decisions, and its differences."""
     if tables.cuts:
@@ -489,7 +494,7 @@ def _cut_episodes(
         done, cuts = cut_by_decisions(done)
     if cuts is None:
         return ()
-    return (*read_anytime_curve(done, cuts, seed), *compare_anytime_curves(done, pairs, cuts, seed))
+    return (*read_anytime_curve(done, cuts, seed), *compare_anytime_curves(done, pairs, cuts, seed, anytime))
 
 
 def _label(metric: Metric, marks: Marks | None) -> Metric:
@@ -633,7 +638,9 @@ def _explain_utility(summary: Summary) -> list[str]:
         return []
     found = ["U = (SR - copy) / (oracle - copy), on the episodes scored in all three; Fieller's interval."]
     if any(not one.is_defined for one in summary.utilities):
-        found.append("Utility undefined: the interval for oracle - copy includes 0.")
+        span = [each for each in summary.differences if (each.arm, each.base, each.metric) == SPAN]
+        below = any(each.estimate.high < 0 for each in span)
+        found.append(f"Utility undefined: the interval for oracle - copy {'lies below' if below else 'includes'} 0.")
     return found
 
 

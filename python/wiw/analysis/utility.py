@@ -33,7 +33,7 @@ class Utility:
 
     arm: str
     value: float
-    """0: as the floor; 1: as the ceiling; nan where the interval for ceiling - floor includes 0."""
+    """0: as the floor; 1: as the ceiling; nan where the interval for ceiling - floor does not lie above 0."""
     low: float
     high: float
     n: int

@@ -143,10 +143,11 @@ def _show_difference(found: Difference | None, form: str) -> str:
 
 
 def _show(found: Estimate | None, form: str = ".3f") -> str:
-    """Return e.g. "+0.041 [0.012, 0.070]"; "–" where it is not known."""
+    """Return e.g. "+0.041 [0.012, 0.070]"; "–" where it is not known, "[?]" for one episode's interval."""
     if found is None or math.isnan(found.value):
         return "–"
-    return f"{found.value:+{form}} [{found.low:{form}}, {found.high:{form}}]"
+    interval = "[?]" if math.isnan(found.low) else f"[{found.low:{form}}, {found.high:{form}}]"
+    return f"{found.value:+{form}} {interval}"
 
 
 def _name_step(measure: str) -> str:

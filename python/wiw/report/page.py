@@ -260,6 +260,7 @@ def _draw_plots(
         if plots.shows_single_outcomes(ways):
             about += f" One circle per episode; filled: {words.won}, hollow: {words.lost}."
         found.append(("Success by distance", about, plots.success_by_distance(ways, words)))
+    truths = [line for line in truths if "success" in summary[line.arm].estimates]
     if sum(not math.isnan(line.rank) for line in truths) > 1:
         about = "Does an arm that ranks plans correctly also succeed? Kendall's tau against the true futures."
         found.append(("Rank agreement and success", about, plots.success_by_rank(truths, summary)))

@@ -16,6 +16,7 @@ from matplotlib import rc_context
 from matplotlib.axes import Axes
 from matplotlib.colors import to_rgb
 from matplotlib.figure import Figure
+from matplotlib.text import Text
 from matplotlib.ticker import MaxNLocator
 
 from wiw.analysis.blame import Blame
@@ -50,6 +51,10 @@ TICKS = 5
 """Maximum number of intervals between the numbers of an axis: more collide where names of arms or fonts are wide."""
 WIDEST_LABEL = 36
 """Characters on a line of a long label beside an axis."""
+HEIGHT, LINE = 3.1, 0.2
+"""Inches: of a plot, and what each line of a name, or row of a legend, needs where that is more."""
+LEGEND_ROWS = 4
+"""Rows of a legend for which a plot has room."""
 FEW = 24
 """Below this many episodes single outcomes are shown instead of binned rates."""
 
@@ -66,7 +71,7 @@ def success_by_arm(summary: Summary) -> Markup:
     """Plot success rates with their intervals; floor and oracle as lines through the others."""
     lines = [line for line in summary.arms if "success" in line.estimates]
     colors = arm_colors([line.name for line in summary.arms])
-    figure, axes = _make_figure()
+    figure, axes = _make_figure([line.name for line in lines])
     for y, line in enumerate(reversed(lines)):
         found = line.estimates["success"]
         if line.name in ("copy", "oracle"):
@@ -88,7 +93,11 @@ def success_by_rollouts(series: Mapping[str, Sequence[tuple[float, Any, str]]]) 
     figure, axes = _make_figure()
     for name, points in series.items():
         axes.plot(
-            [x for x, _, _ in points], [found.value for _, found, _ in points], "-o", color=colors[name], label=name
+            [x for x, _, _ in points],
+            [found.value for _, found, _ in points],
+            "-o",
+            color=colors[name],
+            label=_label(name),
         )
         for x, found, label in points:
             axes.plot([x, x], [found.low, found.high], color=colors[name], lw=4, alpha=0.3, solid_capstyle="round")
@@ -109,7 +118,7 @@ def success_by_rank(truths: Sequence[ArmFidelity], summary: Summary) -> Markup:
     for line in truths:
         estimate = summary[line.arm].estimates["success"]
         axes.plot([line.rank] * 2, [estimate.low, estimate.high], color=colors[line.arm], lw=4, alpha=0.35)
-        axes.plot(line.rank, estimate.value, "o", color=colors[line.arm], ms=9, label=line.arm)
+        axes.plot(line.rank, estimate.value, "o", color=colors[line.arm], ms=9, label=_label(line.arm))
     axes.set_xlim(-1.05, 1.05)
     axes.set_ylim(-3, 103)
     axes.set_xlabel("rank agreement, Kendall's tau")
@@ -153,7 +162,7 @@ def _draw_success_by_measure(axes: Axes, found: QualityTable, measure: str, labe
         axes.plot([value.value] * 2, [success.low, success.high], color=color, lw=4, alpha=0.35, solid_capstyle="round")
         if not math.isnan(value.low):
             axes.plot([value.low, value.high], [success.value] * 2, color=color, lw=1.2, alpha=0.6)
-        axes.plot(value.value, success.value, "o", color=color, ms=9, label=line.arm)
+        axes.plot(value.value, success.value, "o", color=color, ms=9, label=_label(line.arm))
     axes.set_ylim(-3, 103)
     axes.xaxis.set_major_locator(MaxNLocator(TICKS))
     axes.set_xlabel(label)
@@ -323,7 +332,7 @@ def _find_error_point(line: ErrorLine, regret: bool) -> Any:
 def blame_by_arm(found: Blame) -> Markup:
     """Plot each arm's failures by the stage to blame, as stacked bars."""
     lines = list(reversed(found.arms))
-    figure, axes = _make_figure()
+    figure, axes = _make_figure([line.arm for line in lines])
     left = np.zeros(len(lines))
     for verdict in found.scheme.verdicts:
         color = BLAME_COLORS[verdict]
@@ -353,8 +362,9 @@ def blame_by_arm(found: Blame) -> Markup:
 def success_by_distance(outcomes: Outcomes, words: Wording) -> Markup:
     """Plot success by path length: single episodes where there are few, else rates in bins of equal counts."""
     colors = arm_colors(list(outcomes))
-    figure, axes = _make_figure()
-    if shows_single_outcomes(outcomes):
+    single = shows_single_outcomes(outcomes)
+    figure, axes = _make_figure(list(outcomes) if single else ())
+    if single:
         _draw_outcome_dots(axes, outcomes, colors)
     else:
         _draw_binned_rates(axes, outcomes, colors)
@@ -381,12 +391,16 @@ def _draw_outcome_dots(axes: Axes, outcomes: Outcomes, colors: Mapping[str, str]
 def _draw_binned_rates(axes: Axes, outcomes: Outcomes, colors: Mapping[str, str]) -> None:
     lengths = np.array([row["geodesic"] for rows in outcomes.values() for row in rows])
     edges = np.unique(np.quantile(lengths, np.linspace(0, 1, 5)))
+    span = edges[-1] - edges[0]
+    if len(edges) == 1:  # all are equally long: one bin
+        edges, span = np.repeat(edges, 2), edges[0] or 1.0
+        axes.set_xlim(right=edges[0] + 0.03 * span * (1 + len(outcomes) / 2))
     for shift, (arm, rows) in enumerate(outcomes.items()):
         ways = np.array([row["geodesic"] for row in rows])
         reached = np.array([row["metrics"].get("success", 0.0) for row in rows])
         which = np.clip(np.searchsorted(edges, ways, side="right") - 1, 0, len(edges) - 2)
         points = [(i, reached[which == i]) for i in range(len(edges) - 1) if (which == i).any()]
-        offset = 0.03 * (edges[-1] - edges[0]) * (shift - (len(outcomes) - 1) / 2)
+        offset = 0.03 * span * (shift - (len(outcomes) - 1) / 2)
         x = [(edges[i] + edges[i + 1]) / 2 + offset for i, _ in points]
         y = [100 * values.mean() for _, values in points]
         spans = [wilson(float(values.mean()), len(values)) for _, values in points]
@@ -395,7 +409,15 @@ def _draw_binned_rates(axes: Axes, outcomes: Outcomes, colors: Mapping[str, str]
             [100 * high - value for value, (_, high) in zip(y, spans, strict=True)],
         ]
         axes.errorbar(
-            x, y, yerr=np.clip(bars, 0, None), color=colors[arm], marker="o", ms=6, lw=1.6, elinewidth=1, label=arm
+            x,
+            y,
+            yerr=np.clip(bars, 0, None),
+            color=colors[arm],
+            marker="o",
+            ms=6,
+            lw=1.6,
+            elinewidth=1,
+            label=_label(arm),
         )
     axes.set_ylim(-3, 103)
     axes.set_ylabel("success rate, %")
@@ -445,7 +467,7 @@ def _draw_bands(axes: Axes, found: Breakdown, colors: Mapping[str, str]) -> None
         x, values = [cut for cut, _ in points], [one.value for _, one in points]
         bands = [one.low for _, one in points], [one.high for _, one in points]
         axes.fill_between(x, *bands, color=colors[arm], alpha=0.14, lw=0)
-        axes.plot(x, values, "-o", color=colors[arm], lw=2, ms=5, label=arm)
+        axes.plot(x, values, "-o", color=colors[arm], lw=2, ms=5, label=_label(arm))
     axes.set_xlim(0, cuts[-1] * 1.03)
     axes.set_xticks([0, *cuts])
     axes.set_xlabel(found.cut_unit)
@@ -468,8 +490,15 @@ def _fold(arm: str) -> str:
     return "\n".join(lines)
 
 
-def _make_figure() -> tuple[Figure, Axes]:
-    figure = Figure(figsize=(4.7, 3.1), layout="constrained")
+def _label(arm: str) -> str:
+    """Return an arm's name for a legend, from which matplotlib leaves out those that begin with an underscore."""
+    return f" {arm}" if arm.startswith("_") else arm
+
+
+def _make_figure(rows: Sequence[str] = ()) -> tuple[Figure, Axes]:
+    """Return a plot, high enough for the names of arms beside its axis, if these are its `rows`."""
+    lines = sum(_fold(arm).count("\n") + 1 for arm in rows)
+    figure = Figure(figsize=(4.7, max(HEIGHT, 0.6 + LINE * lines)), layout="constrained")
     axes = figure.add_subplot()
     _style_axes(axes)
     return figure, axes
@@ -491,6 +520,9 @@ def _draw_legend(axes: Axes) -> None:
     longest = max(map(len, texts), default=0)
     widest = 4 if longest < 11 else 2 if longest < 20 else 1  # columns that fit the drawing's width
     columns = math.ceil(len(texts) / math.ceil(len(texts) / widest)) if texts else 1  # rows of about equal length
+    more = math.ceil(len(texts) / columns) - LEGEND_ROWS
+    if isinstance(figure := axes.figure, Figure):
+        figure.set_figheight(figure.get_figheight() + LINE * max(0, more))
     axes.legend(frameon=False, labelcolor=INK, fontsize=9, ncols=columns, loc="lower left", bbox_to_anchor=(0, 1))
 
 
@@ -498,13 +530,21 @@ def _draw_on_white(figure: Figure, form: str, salt: str) -> bytes:
     """Return a figure as "svg" or "png"; `salt` makes ids in SVG."""
     buffer = io.BytesIO()
     metadata: dict[str, Any] = {"Date": None, "Creator": None} if form == "svg" else {"Software": None}
+    _show_text_as_it_is(figure)
     with rc_context({"svg.fonttype": "none", "svg.hashsalt": salt, "font.family": "sans-serif"}):
         figure.savefig(buffer, format=form, dpi=160, facecolor="white", metadata=metadata)
     return buffer.getvalue()
 
 
+def _show_text_as_it_is(figure: Figure) -> None:
+    """Draw dollar signs, which names of arms may have, instead of formulas between them."""
+    for text in figure.findobj(Text):
+        text.set_parse_math(False)
+
+
 def _render_svg(figure: Figure, name: str) -> Markup:
     buffer = io.StringIO()
+    _show_text_as_it_is(figure)
     with rc_context({"svg.fonttype": "none", "svg.hashsalt": name, "font.family": "sans-serif"}):
         figure.savefig(buffer, format="svg", transparent=True, metadata={"Date": None, "Creator": None})
     drawing = buffer.getvalue().replace(INK, "currentColor")

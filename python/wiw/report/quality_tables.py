@@ -58,7 +58,6 @@ def arm_rows(table: QualityTable) -> tuple[list[str], list[list[str]]]:
 def explain(table: QualityTable) -> list[str]:
     """Return what was measured, by whom, and what it does not show."""
     pictured, episodes = _count(table.pictured, "episode"), _count(table.episodes, "episode")
-    pictured, episodes = _count(table.pictured, "episode"), _count(table.episodes, "episode")
     sizes = (
         f"{table.frames} frames of each arm, the same ones, of {pictured} with pictures; {table.outcome} over "
         f"{episodes} of {_count(table.scenes, 'scene')}, scored in every arm."

@@ -249,17 +249,20 @@ def _make_breakdown_tables(breakdown: Breakdown, gap: str, width: int) -> list[T
 def _make_difference_tables(summary: Summary, group: Group, gap: str, width: int) -> list[Table]:
     """Return one group's paired differences; `gap` stands between an estimate and its interval."""
     rows = list(group.rows.values())
-    metrics = [metric for metric in list_columns(summary) if all(metric.name in row for row in rows)]
+    metrics = [metric for metric in list_columns(summary) if any(metric.name in row for row in rows)]
     columns = [
-        Column(column_title(metric), [_format_difference(row[metric.name], gap) for row in rows]) for metric in metrics
+        Column(column_title(metric), [_format_difference(row.get(metric.name), gap) for row in rows])
+        for metric in metrics
     ]
-    leading = [row[metrics[0].name] for row in rows]
-    columns.append(Column("W/L", [f"{one.wins}/{one.losses}" for one in leading]))
-    columns.append(Column("p", [show_p(one.p_adjusted) for one in leading]))
+    leading = [row.get(metrics[0].name) for row in rows]
+    columns.append(Column("W/L", ["–" if one is None else f"{one.wins}/{one.losses}" for one in leading]))
+    columns.append(Column("p", ["–" if one is None else show_p(one.p_adjusted) for one in leading]))
     return stack_tables(group.title, list(group.rows), columns, width)
 
 
-def _format_difference(difference: Difference, gap: str) -> Text:
+def _format_difference(difference: Difference | None, gap: str) -> Text:
+    if difference is None:
+        return Text("–")
     return _format_estimate(difference.estimate, gap, True, difference.is_shown)
 
 

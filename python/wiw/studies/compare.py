@@ -140,7 +140,7 @@ def compare(
         names,
         (*unlike, *(line for pair in pairs for line in _describe_changes(first, second, pair))),
         unbalanced=count_unbalanced(second),
-        looks="One of the runs was stopped early by a rule." if anytime else "",
+        looks=_describe_looks(first, second, names),
     )
 
 
@@ -152,9 +152,23 @@ def _open(run: str | Path | RunLog, judge: str | None) -> RunLog:
 
 
 def _summarise_arms(log: RunLog, both: Summary, labels: Mapping[str, str]) -> list[ArmSummary]:
-    """Return the lines of one run's arms, with their roles in it; `labels` by arm."""
+    """Return the lines of one run's arms, with their roles in it and what it still has to run; `labels` by arm."""
     policies = [one["name"] for one in log.store.config["arms"] if one["agent"].get("model") is None]
-    return [replace(both[label], role=role_of(arm, policies)) for arm, label in labels.items()]
+    lines = [replace(both[label], role=role_of(arm, policies)) for arm, label in labels.items()]
+    if "stopped" not in log.store.info:
+        return lines
+    episodes = len(log.store.own_episodes())
+    return [replace(line, pending=episodes - line.done - line.errors) for line in lines]
+
+
+def _describe_looks(a: RunLog, b: RunLog, names: tuple[str, str]) -> str:
+    """Return which runs a rule was to stop early, and whether it did; empty if none."""
+    found = []
+    for log, name in zip((a, b), names, strict=True):
+        if "until" in (info := log.store.info):
+            ended = f"it stopped at {info['stopped']['why']}" if "stopped" in info else "it has not been stopped so far"
+            found.append(f"{name} was checked as it ran, to stop once {info['until']['rule']}; {ended}.")
+    return " ".join(found)
 
 
 def _list_utilities(log: RunLog, labels: Mapping[str, str]) -> list[Utility]:

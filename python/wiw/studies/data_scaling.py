@@ -261,7 +261,10 @@ def _group_by_setting(measures: Mapping[Training, Measures]) -> dict[str, list[M
 def _run_imagenav(
     jobs: Sequence[TrainingJob], plan: ScalingPlan, folder: Path, episodes: int, workers: int
 ) -> list[Success]:
-    """Run the models of the first seed in closed loop on the same episodes, or continue with that."""
+    """Run the models of the first seed in closed loop on the same episodes, or continue with that.
+
+    Arms without a scored episode are left out.
+    """
     from wiw.loop.agent import Agent
     from wiw.studies.evaluate import evaluate
 
@@ -276,7 +279,8 @@ def _run_imagenav(
         keep_images=0,
         seed=0,
     )
-    return [Success(line.name, line.estimates["success"]) for line in log.numbers().arms]
+    arms = log.numbers().arms
+    return [Success(line.name, line.estimates["success"]) for line in arms if "success" in line.estimates]
 
 
 def name_arms(jobs: Sequence[TrainingJob], seed: int) -> dict[str, str]:

@@ -161,10 +161,12 @@ def _run(run: StudyRun, folder: Path, workers: int, progress: bool) -> StudyPart
 
 
 def _compare(run: StudyRun, log: RunLog) -> tuple[Difference, ...]:
-    """Return the differences of the study's pairs; p-values are adjusted for all of them."""
+    """Return the differences of the study's pairs; p-values are adjusted for all of them, and for looks at the run."""
     done, _ = split_outcomes(log.arms, log.store.outcomes())
-    seed = log.store.config["seed"]
+    seed, anytime = log.store.config["seed"], "until" in log.store.info
     found = [
-        compare_arms(arm, base, done, metric, seed) for arm, base in run.compare for metric in select_metrics(done)
+        compare_arms(arm, base, done, metric, seed, anytime)
+        for arm, base in run.compare
+        for metric in select_metrics(done)
     ]
     return adjust_p_values([each for each in found if each is not None])

@@ -62,7 +62,7 @@ def _top(figure: Figure, place: Any, decision: Decision) -> None:
     if goal is not None and goal.image is not None:
         _picture(figure.add_subplot(columns[0, 1]), goal.image, "goal")
     if goal is not None and goal.text:
-        figure.suptitle(goal.text)
+        figure.suptitle(goal.text, parse_math=False)
 
 
 def _choose_picture(observation: Observation | ArmObservation) -> tuple[NDArray[np.uint8], str]:

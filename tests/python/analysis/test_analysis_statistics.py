@@ -107,6 +107,12 @@ def test_many_flips_are_drawn_by_the_seed():
     assert p_value == pytest.approx(expected, abs=0.02)
 
 
+@pytest.mark.parametrize("size", [1e9, 1e13, 1e19])
+def test_flips_of_large_whole_numbers_take_little_memory(size):
+    sums = np.array([1.0, 2, 3, -1, 1, 1, 1, 1])
+    assert flip_signs(size * sums) == pytest.approx(flip_signs(sums))
+
+
 def test_approximate_flips_are_near_the_exact_ones():
     sums = np.random.default_rng(5).integers(-3, 4, (400, 20)).astype(float)
     exact = np.array([flip_signs(one) for one in sums])

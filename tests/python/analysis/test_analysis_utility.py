@@ -92,6 +92,12 @@ def test_utility_is_undefined_where_the_interval_of_ceiling_minus_floor_includes
     assert summary().difference("oracle", "copy").estimate.low > 0 and summary().utility("mine").is_defined
 
 
+def test_an_oracle_that_is_worse_than_the_floor_is_said_to_be():
+    found = summary({**RATES, "copy": 0.8, "oracle": 0.1})
+    assert found.difference("oracle", "copy").estimate.high < 0 and not found.utility("mine").is_defined
+    assert "Utility undefined: the interval for oracle - copy lies below 0." in notes(found)
+
+
 def test_only_episodes_that_all_three_have_finished_count():
     outcomes = [row for row in run(RATES) if not (row["arm"] == "copy" and row["episode"] < 20)]
     one = summarise(list(RATES), outcomes, 60).utility("mine")

@@ -76,3 +76,22 @@ def test_it_is_for_pages_and_exports_not_for_the_terminal() -> None:
     found = SummaryTable.of(summarise_answers(ANSWERS))
     assert "oracle" in as_text(found) and "within N" not in as_text(found)
     assert "oracle" in summary_html(found) and "within N" not in summary_html(found)
+
+
+def test_a_run_that_was_looked_at_has_bold_differences_by_the_betting_test() -> None:
+    """Seven scenes of twenty are won: enough for a test at a fixed number of episodes, not for one at any look."""
+    outcomes = [
+        {
+            "arm": arm,
+            "episode": i,
+            "scene": f"s{i}",
+            "status": "done",
+            "metrics": {"success": float(arm == "oracle" and i < 7), "decisions": 2.0},
+        }
+        for arm in ("none", "oracle")
+        for i in range(20)
+    ]
+    for anytime in (False, True):
+        found = summarise(["none", "oracle"], outcomes, 20, anytime=anytime)
+        (gain,) = [each for each in found.breakdowns if each.name == "anytime_differences"]
+        assert found.difference("oracle", "none").is_shown == bool(gain.shown) == (not anytime)

@@ -1,4 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
+import json
+import re
+import sqlite3
+from contextlib import closing
 from html.parser import HTMLParser
 
 import numpy as np
@@ -11,12 +15,14 @@ from wiw.report.episodes import read_stories
 from wiw.report.maps import frame_of_picture, frame_of_points, start_and_goal, trail
 from wiw.report.page import SCALES, _gather_findings, _render_page, render, sentence
 from wiw.report.plans import format_glyphs
-from wiw.report.plots import BLAME_COLORS, _choose_text_color
+from wiw.report.plots import BLAME_COLORS, _choose_text_color, success_by_arm, success_by_distance
 from wiw.report.story import Album
 from wiw.report.templating import environment
 from wiw.runs.pictures import choose_pictured_episodes
+from wiw.runs.store_file import store_path
 from wiw.studies.evaluate import run_arms
-from wiw.types import Episode
+from wiw.studies.run_log import load_run
+from wiw.types import Episode, Wording
 
 EVIL = "<script>alert(1)</script>"
 
@@ -185,6 +191,56 @@ def test_text_from_a_run_is_escaped(tmp_path):
 def test_a_run_without_an_ended_episode_still_has_a_page(tmp_path):
     log = run_arms(LineTask(broken=("0000",)), {"none": LineAgent()}, 1, out=tmp_path / "run", progress=False)
     assert "Infrastructure errors" in render(log)
+
+
+def test_an_arm_with_errors_alone_is_left_out_of_the_plot_of_ranks(tmp_path):
+    arms = {name: LineAgent() for name in ("none", "warp", "oracle")}
+    with closing(run_arms(LineTask(), arms, 2, out=tmp_path / "run", progress=False)):
+        pass
+    ranked = {"scores": [0.25, 0.5], "rank": 0.5, "regret": 0.1, "best": False, "psnr": [21.5] * 2, "ssim": [0.7] * 2}
+    with closing(sqlite3.connect(store_path(tmp_path / "run"))) as store, store:
+        store.execute("UPDATE decision SET fidelity = ?", (json.dumps(ranked),))
+        store.execute(
+            "UPDATE outcome SET status = 'error', metrics = '{}', error = 'RuntimeError: lost', kind = 'environment' "
+            "WHERE arm = 'warp'"
+        )
+    with closing(load_run(tmp_path / "run")) as log:
+        figures = {title: str(drawing) for title, _, drawing in _gather_findings(log)["plots"]}
+    assert ">oracle<" in figures["Rank agreement and success"] and "warp" not in figures["Rank agreement and success"]
+
+
+def list_ways(arms, length):
+    """Return 30 ended episodes, the i-th with a path of `length(i)` metres, the same of each arm."""
+    rows = [{"geodesic": length(i), "metrics": {"success": float(i % 3 == 0)}} for i in range(30)]
+    return dict.fromkeys(arms, rows)
+
+
+def list_single(arms):
+    """Return an ended episode of each arm."""
+    return [{"arm": arm, "episode": 0, "scene": "s", "status": "done", "metrics": {"success": 1.0}} for arm in arms]
+
+
+@pytest.mark.parametrize("name", ["a$^$b", "$b$", "_mine", "__"])
+def test_plots_show_names_of_arms_as_they_are(name):
+    assert f">{name}<" in success_by_arm(summarise(["none", name], list_single(["none", name]), 1))
+    drawn = str(success_by_distance(list_ways(["none", name], lambda i: 3.0 + i), Wording()))
+    assert f">{name}<" in drawn.replace("> ", ">")
+
+
+def test_equally_long_paths_are_one_bin_with_the_arms_beside_each_other():
+    drawn = success_by_distance(list_ways(["none", "warp"], lambda i: 4.0), Wording())
+    uneven = success_by_distance(list_ways(["none", "warp"], lambda i: 4.0 + (i >= 15)), Wording())
+    marker = re.compile(r'<use [^>]*x="([\d.]+)"[^>]*style="fill: #(?:8b9099|4c78a8)')
+    assert [len(set(marker.findall(each))) for each in (drawn, uneven)] == [4, 6]  # of which two in the legend
+
+
+def test_plots_of_many_arms_have_room_for_their_names():
+    names = ["none", *(f"error-blur@{number}" for number in range(40))]
+    beside = success_by_arm(summarise(names, list_single(names), 1))
+    above = success_by_distance(list_ways(names, lambda i: 3.0 + i), Wording())
+    few = success_by_arm(summarise(names[:3], list_single(names[:3]), 1))
+    heights = [float(re.search(r'height="([\d.]+)pt"', each)[1]) for each in (beside, above, few)]
+    assert heights[0] > 41 * 12 and heights[1] > 20 * 12 + 150 and heights[2] == pytest.approx(3.1 * 72)
 
 
 def summary(wins, n=40, saved=0.0):

@@ -12,9 +12,11 @@ from fakes import LineAgent, LineTask
 from rich.console import Console
 
 from wiw.analysis.costs import COLUMNS, costs
-from wiw.analysis.summary import show_estimate
+from wiw.analysis.summary import show_estimate, summarise
 from wiw.cli import main
 from wiw.report import tables
+from wiw.report.page import summary_html
+from wiw.report.tables import SummaryTable
 from wiw.runs.store_file import store_path
 from wiw.studies.evaluate import run_arms
 
@@ -86,3 +88,22 @@ def test_the_end_of_a_run_prints_fidelity(log, capsys):
     from wiw.cli.run import finish
 
     assert finish(log, report=False) == 0 and "Fidelity of imagination" in capsys.readouterr().out
+
+
+@pytest.mark.parametrize("width", [60, 140])
+def test_a_metric_that_one_arm_lacks_is_shown_of_the_others(width):
+    rows = [
+        {"arm": arm, "episode": i, "scene": f"s{i}", "status": "done", "metrics": {"success": float(i % 2)}}
+        for arm in ("none", "half", "whole")
+        for i in range(4)
+    ]
+    for row in rows:
+        if row["arm"] != "half":
+            row["metrics"] |= {"grounded": float(row["arm"] == "whole"), "spl": 0.5}  # type: ignore[operator]
+    found = SummaryTable.of(summarise(["none", "half", "whole"], rows, 4))
+    console = Console(width=width, file=io.StringIO(), record=True)
+    console.print(found)
+    shown = squeeze(console.export_text().partition("Difference from none")[2])
+    assert "Grounded % ↑" in shown and "+100.0" in shown and "SPL" not in shown.partition("none:")[0]
+    html = summary_html(found).partition("differences")[2]
+    assert html.count('<td class="number">–</td>') == 1 and "Grounded, points" in html and "SPL, points" not in html

@@ -7,6 +7,7 @@ import json
 import shutil
 from dataclasses import asdict, replace
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
@@ -18,12 +19,15 @@ from wiw.analysis.data_scaling import (
     FEWER_SCENES,
     ONE_EPOCH,
     Resampled,
+    Success,
     fit_power_law,
     measure_trend,
     split_gain,
 )
+from wiw.analysis.statistics import estimate_mean
 from wiw.cli import main
 from wiw.errors import ArgumentError, FileError
+from wiw.metrics.metric import SUCCESS
 
 pytest.importorskip("pyarrow", reason="needs wiw[export]")
 torch = pytest.importorskip("torch", reason="needs wiw[torch]")
@@ -31,7 +35,7 @@ torch = pytest.importorskip("torch", reason="needs wiw[torch]")
 from wiw.datasets.navigation import NavigationData, SelectedClips, part_of  # noqa: E402
 from wiw.runs.recipes import arm_recipes  # noqa: E402
 from wiw.studies import data_scaling_plan as planning  # noqa: E402
-from wiw.studies.data_scaling import DataScaling, make_plan, name_arms  # noqa: E402
+from wiw.studies.data_scaling import DataScaling, _run_imagenav, make_plan, name_arms  # noqa: E402
 from wiw.studies.data_scaling_plan import (  # noqa: E402
     SMALL,
     ScalingPlan,
@@ -135,6 +139,14 @@ def test_trainings_are_paired_by_scene_and_seed() -> None:
     assert (means.mean("a") - means.mean("b")).interval().low == pytest.approx(1)
     own = means.mean("a").interval()
     assert own.high - own.low > 1
+
+
+def test_draws_of_scenes_without_a_value_are_left_out() -> None:
+    few = {"a": [10.0, 2.0], "b": [12.0, 2.0]}
+    means = Resampled({"a": [{**few, "c": [0.0, 0.0], "d": [0.0, 0.0]}]})
+    found = means.mean("a")
+    assert np.isnan(found.drawn).any()
+    assert found.interval().low >= 5 and found.interval().high <= 6
 
 
 # -- the plan ----------------------------------------------------------------------------------------------------------
@@ -334,6 +346,16 @@ def test_a_training_that_was_stopped_ends_with_the_same_weights(
     for name, value in whole.state_dict().items():
         assert torch.equal(resumed.state_dict()[name], value), name
     assert list(job.weights.parent.iterdir()) == [job.weights]
+
+
+def test_models_whose_episodes_all_ended_with_errors_are_left_out(
+    study: DataScaling, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    rate = estimate_mean([0.0, 1.0], ["a", "b"], SUCCESS)
+    arms = [SimpleNamespace(name="none", estimates={"success": rate}), SimpleNamespace(name="broken", estimates={})]
+    log = SimpleNamespace(numbers=lambda: SimpleNamespace(arms=arms))
+    monkeypatch.setattr("wiw.studies.evaluate.evaluate", lambda *_, **__: log)
+    assert _run_imagenav([], study.plan, study.out, 2, 1) == [Success("none", rate)]
 
 
 def test_models_become_arms_of_a_run(study: DataScaling, dataset: Path) -> None:

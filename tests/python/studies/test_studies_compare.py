@@ -174,3 +174,20 @@ def test_infrastructure_errors_leave_their_pair_out(runs, tmp_path):
     found = wiw.compare(runs[0], tmp_path / "run")
     assert found.difference("warp · run", "warp · old").estimate.n == 15
     assert found["warp · run"].errors == 1
+
+
+def test_a_run_that_a_rule_stopped_has_nothing_left_to_run(tmp_path):
+    arms = {"none": LineAgent(0.1), "warp": LineAgent(0.9)}
+    paths = tmp_path / "whole", tmp_path / "stopped"
+    for path, rule in zip(paths, ("width<1", "width<100"), strict=True):
+        run_arms(LineTask(), arms, 20, out=path, progress=False, until=rule, look_every=10).close()
+    found = wiw.compare(*paths)
+    assert {line.name: (line.done, line.pending) for line in found.arms} == {
+        "none · whole": (20, 0),
+        "none · stopped": (10, 0),
+        "warp · whole": (20, 0),
+        "warp · stopped": (10, 0),
+    }
+    whole, stopped = found.looks.split(" stopped was checked")
+    assert whole == "whole was checked as it ran, to stop once width<1; it has not been stopped so far."
+    assert stopped.startswith(" as it ran, to stop once width<100; it stopped at 10 of 20 episodes: none ")

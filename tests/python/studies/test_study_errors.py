@@ -15,7 +15,7 @@ from wiw.cli import main
 from wiw.errors import ArgumentError, StoreError
 from wiw.experiments.errors.kinds import ERRORS
 from wiw.report.error_page import write_errors
-from wiw.report.error_tables import explain, print_errors
+from wiw.report.error_tables import explain, list_lines, print_errors
 from wiw.studies.errors import ErrorSettings, make_recipes, read_errors, study_errors
 
 ARMS = {"error-blur@64": ("blur", 64.0), "error-lag@2": ("lag", 2.0), "error-lag@4": ("lag", 4.0)}
@@ -101,6 +101,13 @@ def test_unfinished_arms_are_shown_but_not_counted_among_the_costs() -> None:
     found = summarise_errors("imagenav", "matcher", cut, decisions(), ARMS)
     assert [line.arm for line in found.lines] == ["error-blur@64", "error-lag@2"]
     assert found.episodes == EPISODES and {cost.family for cost in found.costs} == {"looks"}
+
+
+def test_a_single_episode_has_no_interval_of_regret() -> None:
+    first = [row for row in outcomes() if row["episode"] == 0]
+    found = summarise_errors("imagenav", "matcher", first, decisions(), ARMS)
+    cells = [cell for _, own in list_lines(found) for cell in own]
+    assert "+1.000 [?]" in cells and not any("nan" in cell for cell in cells)
 
 
 def test_an_error_that_costs_nothing_so_far_is_not_sure_to_cost_nothing(table) -> None:

@@ -5,16 +5,21 @@ from __future__ import annotations
 
 import json
 import re
+from contextlib import closing
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import pytest
 import yaml
+from fakes import LineAgent, LineTask
 
 import wiw
 from wiw.cli.app import main
 from wiw.errors import ArgumentError, FileError, StoreError
 from wiw.runs.config import RunConfig
+from wiw.studies.evaluate import run_arms
+from wiw.studies.study import _compare
 from wiw.studies.study_file import list_studies, load_study, parse_variables
 
 OWN = """
@@ -224,3 +229,12 @@ def test_the_study_of_language_models_asks_each_server_for_its_part(tmp_path: Pa
     assert "answer b" in asked["other-answers"] and "answer a" in asked["other-revises"]
     assert "move b" in asked["other-revises"] and "propose b" in asked["other-proposes"]
     assert not any(each.endswith(" b") for each in asked["base"])
+
+
+def test_pairs_of_a_run_that_was_looked_at_have_the_p_of_bets(tmp_path: Path) -> None:
+    arms = {"none": LineAgent(0.1), "warp": LineAgent(0.9)}
+    run: Any = SimpleNamespace(compare=(("warp", "none"),))
+    with closing(run_arms(LineTask(), arms, 16, out=tmp_path, progress=False, until="width<1", look_every=8)) as log:
+        found = {each.metric: each.p_value for each in _compare(run, log)}
+        assert found == {each.metric: each.p_value for each in log.numbers().differences}
+    assert found["actions"] == 1

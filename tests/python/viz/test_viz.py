@@ -1,4 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
@@ -33,6 +35,11 @@ def test_show_draws_every_frame_and_marks_the_choice(frames):
     assert titles.count("real, turned") == 1 and sum(title.startswith("imagined") for title in titles) == 9
     assert sum("chosen" in text.get_text() for axes in figure.axes for text in axes.texts) == 1
     assert figure._repr_png_()[:4] == b"\x89PNG"
+
+
+def test_show_writes_dollars_of_a_goal_as_they_are():
+    one = replace(decision(), goal=Goal("aeqa", text="Is it $^$?"))
+    assert wiw.show(one)._repr_png_()[:4] == b"\x89PNG"
 
 
 def test_show_draws_plans_of_poses():
