@@ -24,7 +24,7 @@ from wiw.cli.demo import demo
 from wiw.cli.doctor import doctor
 from wiw.cli.episodes import episodes
 from wiw.cli.export import export
-from wiw.cli.flag_help import join_lines, read_flags
+from wiw.cli.flag_help import hide_defaults, join_lines, read_flags
 from wiw.cli.judge import judge
 from wiw.cli.merge import merge
 from wiw.cli.names import list_names
@@ -47,7 +47,8 @@ from wiw.cli.terminal import printable
 from wiw.cli.train.commands import TRAININGS
 from wiw.cli.verify import verify
 from wiw.cli.view import view
-from wiw.errors import Error
+from wiw.errors import ArgumentError, Error
+from wiw.suggestions import did_you_mean
 
 DESCRIPTION = """Does a world model help an agent succeed, and by how much?
 
@@ -230,6 +231,8 @@ tracker, candidates, horizon, depth, placebo and so on. `wiw study NAME --help` 
     ),
 }
 
+CONFIG = (tyro.conf.OmitArgPrefixes, tyro.conf.HelptextFromCommentsOff)
+
 EXIT_CRASH, EXIT_ERROR, EXIT_INTERRUPTED = 1, 2, 130
 
 
@@ -285,12 +288,13 @@ def _dispatch(arguments: Sequence[str]) -> Any:
     name, *rest = arguments or ["--help"]
     if name in GROUPS:
         return _dispatch_group(name, rest)
+    for function, known, _ in COMMANDS:
+        if name == known:
+            return _run_command(function, f"wiw {name}", rest)
+    _require_like(name, [known for _, known, _ in COMMANDS] + list(GROUPS), "wiw")
     app = tyro.extras.SubcommandApp()
-    named = any(name == known for _, known, _ in COMMANDS)
     for function, known, line in COMMANDS:
-        app.command(name=known, help=None if named else line)(
-            join_lines(function)
-        )  # None: the function's own docstring
+        app.command(name=known, help=line)(join_lines(function))
     for known, group in GROUPS.items():
         app.command(name=known, help=group.line)(_name_group)
     return _run_app(app, "wiw", DESCRIPTION, [name, *rest])
@@ -304,9 +308,13 @@ def _dispatch_group(name: str, arguments: Sequence[str]) -> Any:
     is_own = group.default_takes_words or first.startswith("-")
     if group.default and is_own and first not in (*known, "-h", "--help"):
         given = [group.default, *given]
+    for function, each, _ in group.commands:
+        if given[0] == each:
+            return _run_command(function, f"wiw {name} {each}", given[1:])
+    _require_like(given[0], known, f"wiw {name}")
     app = tyro.extras.SubcommandApp()
     for function, each, line in group.commands:
-        app.command(name=each, help=None if given[0] in known else line)(join_lines(function))
+        app.command(name=each, help=line)(join_lines(function))
     return _run_app(app, f"wiw {name}", group.description, given)
 
 
@@ -315,9 +323,29 @@ def _name_group() -> int:
     raise AssertionError("commands of two words are dispatched before")
 
 
+def _require_like(name: str, known: Sequence[str], prog: str) -> None:
+    """Refuse a word that is no command.
+
+    Raises:
+        ArgumentError: the word, with the commands that are like it.
+    """
+    if not name.startswith("-") and name not in known:
+        choices = ", ".join(known)
+        raise ArgumentError(f"no command '{prog} {name}'; expected one of {choices}.{did_you_mean(name, known)}")
+
+
 def _run_app(app: tyro.extras.SubcommandApp, prog: str, description: str, arguments: Sequence[str]) -> Any:
-    config = (tyro.conf.OmitArgPrefixes, tyro.conf.HelptextFromCommentsOff)
+    with _make_rules():
+        return app.cli(prog=prog, description=description, args=arguments, config=CONFIG)
+
+
+def _run_command(function: Callable[..., int], prog: str, arguments: Sequence[str]) -> Any:
+    """Run a command on its own, so that an error names the flags and the help of no other."""
+    with _make_rules():
+        return tyro.cli(hide_defaults(join_lines(function)), prog=prog, args=arguments, config=CONFIG)
+
+
+def _make_rules() -> tyro.constructors.ConstructorRegistry:
     registry = make_registry()
     registry.struct_rule(read_flags)
-    with registry:
-        return app.cli(prog=prog, description=description, args=arguments, config=config)
+    return registry

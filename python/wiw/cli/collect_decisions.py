@@ -8,6 +8,7 @@ from typing import Annotated
 
 from tyro.conf import arg
 
+from wiw.cli.announcement import count_noun
 from wiw.cli.bars import Bars
 
 
@@ -42,9 +43,12 @@ def collect_decisions(
     """
     from wiw.datasets.decisions import save_decisions
     from wiw.datasets.parquet_files import require_pyarrow
+    from wiw.errors import ArgumentError
     from wiw.training.construct_decisions import DecisionRules
     from wiw.training.construct_decisions import collect_decisions as collect
 
+    if out.exists():
+        raise ArgumentError(f"collect: {out} already exists; remove it, or choose another name with --out")
     require_pyarrow("stored decisions")
     rules = DecisionRules(plans=plans, actions=actions, size=size)
     with Bars() as bars:
@@ -54,5 +58,6 @@ def collect_decisions(
 
         found = collect(scenes, per_scene, seed, rules, show)
     save_decisions(out, found)
-    print(f"{len(found):,} decisions between {plans} plans each, in {len(set(found.scenes))} scenes: {out}")
+    places = count_noun(len(set(found.scenes)), "scene")
+    print(f"{count_noun(len(found), 'decision')} between {plans} plans each, in {places}: {out}")
     return 0

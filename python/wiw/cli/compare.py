@@ -26,10 +26,10 @@ def compare(
 ) -> int:
     """Compare two runs on the same episodes, the second minus the first.
 
-      $ wiw compare runs/old runs/new                          # every arm that both runs have
-      $ wiw compare runs/old /elsewhere/new --arm warp         # one arm
-      $ wiw compare runs/a runs/b --arm warp --other mine      # mine from the second run minus warp from the first
-      $ wiw compare runs/a runs/b --judge rules+llm            # with the marks that `wiw judge` added to both
+    $ wiw compare runs/old runs/new                          # every arm that both runs have
+    $ wiw compare runs/old /elsewhere/new --arm warp         # one arm
+    $ wiw compare runs/a runs/b --arm warp --other mine      # mine from the second run minus warp from the first
+    $ wiw compare runs/a runs/b --judge rules+llm            # with the marks that `wiw judge` added to both
 
     Episodes are compared in pairs, so the runs must have the same task, seed, scenes and episodes, and the same budget
     of decisions and actions; otherwise the error says what differs. Other differences, such as the policy's weights or
@@ -43,8 +43,11 @@ def compare(
         judge: Judge whose marks are compared, by name or digest. Default: each run's own. Different judges are refused.
         unlike_budgets: Compare the runs even if their episodes have different budgets of decisions or actions.
     """
+    from wiw.errors import ArgumentError
     from wiw.report.tables import print_summary
     from wiw.studies.compare import compare as compare_runs
 
+    if other is not None and arm is None:
+        raise ArgumentError(f"compare: --other {other} is an arm of the second run; name one of the first with --arm")
     print_summary(compare_runs(first, second, arm, other, judge=judge, unlike_budgets=unlike_budgets))
     return 0

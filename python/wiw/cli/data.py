@@ -64,7 +64,10 @@ def stats_data(folder: Folder, /, *, clip: Annotated[int, arg(metavar="N")] = 14
     """
     from wiw.datasets.navigation import NavigationData
     from wiw.datasets.navigation_statistics import compute_statistics
+    from wiw.errors import ArgumentError
 
+    if clip < 1:
+        raise ArgumentError(f"data stats: expected --clip of at least 1 frame, got {clip}")
     data = NavigationData(folder)
     _print_totals(compute_statistics(data), clip)
     camera = data.meta["camera"]

@@ -8,6 +8,7 @@ from typing import Annotated, Literal
 
 from tyro.conf import Positional, arg
 
+from wiw.cli.announcement import count_noun
 from wiw.cli.options import Options, task_options
 
 
@@ -66,6 +67,8 @@ def episodes(
     from wiw.errors import ArgumentError, FileError
     from wiw.registry import TASKS
 
+    if episodes < 1:
+        raise ArgumentError(f"episodes: expected --episodes of at least 1, got {episodes}")
     if out.exists() and not overwrite:
         raise ArgumentError(f"{out} already exists; give --overwrite to replace it, or choose another name with --out")
     more = {} if attributes is None else {"attributes": str(attributes)}
@@ -82,11 +85,9 @@ def episodes(
         save(out, found, task, **made.file_header)
     except OSError as error:
         raise FileError(f"{out}: cannot be written ({error.strerror}); choose another with --out") from error
-    places = len({episode.scene for episode in found})
+    places = count_noun(len({episode.scene for episode in found}), "scene")
     lengths = sorted(episode.geodesic for episode in found)
-    print(
-        f"{len(found)} episodes in {places} scene{'s' if places > 1 else ''}, {lengths[0]:.1f} to {lengths[-1]:.1f} m"
-    )
+    print(f"{count_noun(len(found), 'episode')} in {places}, {lengths[0]:.1f} to {lengths[-1]:.1f} m")
     for remark in made.explain_episodes(found):
         print(remark)
     print(f"episodes  {out}")

@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
 """Build the help of flags, one paragraph each.
 
-tyro takes the description of a flag from a docstring, and keeps every line break there. To flags that a dataclass
-declares it also adds "(default: None)", even if their description already says what the default is.
+tyro takes the description of a flag from a docstring, and keeps every line break there. It also adds
+"(default: None)", even if the description already says what the default is.
 """
 
 from __future__ import annotations
@@ -11,6 +11,7 @@ import dataclasses
 import re
 from collections.abc import Callable
 from functools import lru_cache, partial
+from inspect import signature
 from typing import Annotated, Any, get_type_hints
 
 from tyro.conf import arg
@@ -21,6 +22,16 @@ def join_lines(command: Callable[..., int]) -> Callable[..., int]:
     """Make the description of each argument in a command's docstring one line; return the command."""
     text, heading, arguments = (command.__doc__ or "").partition("\n    Args:\n")
     command.__doc__ = text + heading + re.sub(r"\n {12}(?=\S)", " ", arguments)
+    return command
+
+
+@lru_cache
+def hide_defaults(command: Callable[..., int]) -> Callable[..., int]:
+    """Annotate the arguments of a command whose default is None so that it is not shown; return the command."""
+    types = get_type_hints(command, include_extras=True)
+    for name, parameter in signature(command).parameters.items():
+        types[name] = _hide_none(types[name], parameter.default)
+    command.__annotations__ = types
     return command
 
 

@@ -39,13 +39,13 @@ def power(
 ) -> int:
     """Compute how many episodes a run needs to show that one arm succeeds more often than another, or what it can show.
 
-      $ wiw power                        # for differences from 5 to 30 points
-      $ wiw power 10                     # +10 points, e.g. from 20 to 30 %
-      $ wiw power 10 --arms 4            # the same, for one of four arms compared with one base
-      $ wiw power -5 --base 50         # an arm that is 5 points worse
-      $ wiw power --scenes 40            # the smallest difference that 40 scenes of 5 episodes can show
-      $ wiw power 5 --task all           # two models 5 points apart, with what was measured on each task
-      $ wiw power 5 --pilot runs/first --pilot-arms mine,warp  # with what two arms of your own run show
+    $ wiw power                        # for differences from 5 to 30 points
+    $ wiw power 10                     # +10 points, e.g. from 20 to 30 %
+    $ wiw power 10 --arms 4            # the same, for one of four arms compared with one base
+    $ wiw power -5 --base 50           # an arm that is 5 points worse
+    $ wiw power --scenes 40            # the smallest difference that 40 scenes of 5 episodes can show
+    $ wiw power 5 --task all           # two models 5 points apart, with what was measured on each task
+    $ wiw power 5 --pilot runs/first --pilot-arms mine,warp  # with what two arms of your own run show
 
     Arms are compared on the same episodes, so only those episodes count in which one succeeds and the other fails: won
     or lost. 30 % won and 20 % lost give the same difference as 12 % won and 2 % lost, but far weaker evidence, so
@@ -110,7 +110,12 @@ def _find_pilots(task: str | None, run: Path | None, arms: str | None) -> dict[s
     from wiw.runs.store import RunStore
 
     if (run is None) != (arms is None) or (run is not None and task is not None):
-        raise ArgumentError("power: expected --pilot RUN with --pilot-arms ARM,BASE, or --task, or neither")
+        given = [
+            flag for flag, value in (("--pilot", run), ("--pilot-arms", arms), ("--task", task)) if value is not None
+        ]
+        raise ArgumentError(
+            f"power: expected --pilot RUN with --pilot-arms ARM,BASE, or --task, or neither; got {' and '.join(given)}"
+        )
     if run is not None and arms is not None:
         names = [name.strip() for name in arms.split(",")]
         if len(names) != 2:

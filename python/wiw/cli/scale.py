@@ -34,8 +34,8 @@ def scale(
 ) -> int:
     """Measure success against the number of futures that a world model imagines, always on the same episodes.
 
-      $ wiw scale imagenav --world-model warp --candidates 1,2,4,8
-      $ wiw scale imagenav --world-model my_model.py:MyModel --imagine-fraction 0,0.25,0.5,0.75,1
+    $ wiw scale imagenav --world-model warp --candidates 1,2,4,8
+    $ wiw scale imagenav --world-model my_model.py:MyModel --imagine-fraction 0,0.25,0.5,0.75,1
 
     The amounts are nested: a smaller number of candidates takes the first of the largest number, and a smaller share of
     decisions is a subset of a larger one. Writes scale.json and scale.svg next to the run, which works with `wiw

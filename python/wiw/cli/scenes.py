@@ -34,10 +34,13 @@ def draw_scenes(
     from rich.console import Console
     from rich.table import Table
 
+    from wiw.errors import ArgumentError
     from wiw.files import atomic_file
     from wiw.scenes import resolve
     from wiw.viz.contact_sheet import contact_sheet
 
+    if views < 0:
+        raise ArgumentError(f"scenes: expected --views of at least 0, got {views}")
     names = resolve(spec)
     if len(names) > LIMIT:
         print(f"{spec} names {len(names)} scenes; showing the first {LIMIT}")

@@ -24,8 +24,8 @@ def serve_vlm(
 ) -> int:
     """Serve a vision-language model, with the API of OpenAI and vLLM, for tests.
 
-      $ wiw serve-vlm
-      $ wiw serve-vlm --model my_script.py:answer --port 8001
+    $ wiw serve-vlm
+    $ wiw serve-vlm --model my_script.py:answer --port 8001
 
     Then, in another terminal:  wiw run ar --policy vlm --vlm http://localhost:8000/v1
 

@@ -38,9 +38,18 @@ def run_study(
         workers: Number of processes; results do not depend on it.
     """
     from wiw.cli.stop import announce_resume
+    from wiw.cli.study import STUDIES
+    from wiw.errors import ArgumentError
     from wiw.studies.study import study as run
-    from wiw.studies.study_file import parse_variables
+    from wiw.studies.study_file import list_studies, parse_variables
+    from wiw.suggestions import did_you_mean
 
+    known = sorted([*list_studies(), *(name for _, name, _ in STUDIES)])
+    if Path(study).suffix not in (".yaml", ".yml") and study not in known:
+        raise ArgumentError(
+            f"study: no study '{study}'; choose from {', '.join(known)}, or give the path of a .yaml "
+            f"file.{did_you_mean(study, known)}"
+        )
     with announce_resume():
         found = run(study, out=out, variables=parse_variables(set), small=small, workers=workers)
     found.summary()

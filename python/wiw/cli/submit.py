@@ -72,6 +72,8 @@ def submit(
     """
     from wiw.runs.submission import submit_commands
 
+    if shards < 1:
+        raise ArgumentError(f"submit: expected --shards of at least 1, got {shards}")
     for name in ("shard", "resume"):
         if getattr(config, name):
             raise ArgumentError(f"submit: --{name} is set for each job; leave it out")

@@ -104,10 +104,15 @@ def read_json(path: str | Path) -> Any:
             raise ValueError(
                 f"expected an episode file of at most {MOST_BYTES} bytes when unpacked, but it is larger; split it"
             )
-        return parse_json(raw)
     except (OSError, EOFError, ValueError, zlib.error) as error:
         cause = (error.strerror or str(error)) if isinstance(error, OSError) else str(error)  # strerror: no path again
         raise FileError(f"{path}: {cause}") from error
+    try:
+        return parse_json(raw)
+    except ValueError as error:
+        raise FileError(
+            f"{path}: expected an episode file, which is JSON, gzipped if its name ends in .gz; {error}"
+        ) from error
 
 
 def _episode(item: Any, where: str) -> Episode:

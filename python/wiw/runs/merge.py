@@ -54,7 +54,7 @@ class Merged:
         return not self.pending
 
     def __str__(self) -> str:
-        lines = [f"{self.run}: {self.ended} episodes from {self.stores} stores"]
+        lines = [f"{self.run}: {self.ended} episodes from {self.stores} store{'' if self.stores == 1 else 's'}"]
         if self.repeated:
             lines.append(f"{self.repeated} of them were in several stores, with equal records")
         if self.unlike:

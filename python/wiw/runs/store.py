@@ -260,7 +260,7 @@ class RunStore:
     @classmethod
     def _open(cls, path: Path, lock: Any, copy: ScratchCopy | None = None) -> RunStore:
         if not path.is_file():
-            raise StoreError(f"no run at {path}: expected a folder with {FILE_NAME} in it")
+            raise StoreError(f"no run at {path.parent}: expected a folder with {FILE_NAME} in it")
         store = cls(path, connect(path, lock), lock, copy)
         with store._close_on_error():
             store._require_whole()

@@ -69,7 +69,9 @@ def resolve(spec: str | PathLike[str]) -> list[str]:
         return [spec]
     base, mark, edits = spec.partition("?")
     match = re.fullmatch(APARTMENTS, base)
-    if match is None or int(match[2] or 0) >= int(match[3] or SPLIT_SIZE):
+    if match is not None and int(match[2] or 0) >= int(match[3] or SPLIT_SIZE):
+        raise ArgumentError(f"scene spec '{spec}': holds no scene; expected first < end, as in apartments:val:40:60.")
+    if match is None:
         raise ArgumentError(f"scene spec '{spec}': expected {_FORMS}.{_did_you_mean(base)}")
     split, first, end, index = match.groups()
     if index is not None:

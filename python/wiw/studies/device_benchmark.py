@@ -13,6 +13,7 @@ import resource
 import statistics
 import time
 from collections.abc import Callable, Iterator, Sequence
+from contextlib import suppress
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import Any, Literal
@@ -128,6 +129,8 @@ def benchmark_device(
     for name, numbers in (("views", views), ("rows", rows)):
         if numbers is not None and (not numbers or min(numbers) < 1):
             raise ArgumentError(f"bench: expected {name} of at least 1, got {list(numbers)}")
+    with suppress(ModuleNotFoundError):  # torch, which is then said not to be installed
+        _require_networks(networks or ())
     not_run: list[str] = []
     devices = {"cpu": str(describe_platform()["processor"])}
     found: list[Measurement] = []
@@ -216,6 +219,20 @@ def _choose_poses(place: World, count: int) -> NDArray[np.float64]:
 # -- networks ----------------------------------------------------------------------------------------------------------
 
 
+def _require_networks(names: Sequence[str]) -> None:
+    """Refuse a network that is not known.
+
+    Raises:
+        ArgumentError: the first one.
+        ModuleNotFoundError: torch is not installed.
+    """
+    from wiw.studies.network_cases import list_cases
+
+    cases = list_cases()
+    if unknown := sorted(set(names) - set(cases)):
+        raise ArgumentError(f"bench: no network '{unknown[0]}'; expected some of {', '.join(cases)}")
+
+
 def _measure_networks(
     names: Sequence[str] | None,
     rows: Sequence[int] | None,
@@ -233,8 +250,6 @@ def _measure_networks(
     from wiw.studies.network_cases import list_cases
 
     cases = list_cases()
-    if unknown := sorted(set(names or ()) - set(cases)):
-        raise ArgumentError(f"bench: no network '{unknown[0]}'; expected some of {', '.join(cases)}")
     has_cuda = torch.cuda.is_available()
     device = "cuda" if has_cuda else "cpu"
     if has_cuda:

@@ -67,9 +67,13 @@ def test_no_command_shows_help_and_a_wrong_one_is_refused(capsys):
     with pytest.raises(SystemExit):
         main([])
     assert "wiw demo" in capsys.readouterr().out
-    with pytest.raises(SystemExit) as stop:
-        main(["fly"])
-    assert stop.value.code == 2
+    for arguments, message in (
+        (["rnu"], "no command 'wiw rnu'; expected one of demo, list, run,"),
+        (["rnu"], "Did you mean run?"),
+        (["data", "stat"], "expected one of verify, stats, show, export, import. Did you mean stats?"),
+    ):
+        assert main(arguments) == 2
+        assert message in capsys.readouterr().err
 
 
 def test_version(capsys):
@@ -298,7 +302,7 @@ def test_a_run_that_stops_after_it_recorded_something_stays(tmp_path):
 def test_errors_bring_no_escape_sequences_to_the_terminal(tmp_path, capsys):
     assert main(["report", f"{tmp_path}/\x1b[31mred\x1b]0;title\x07\x9b2J\x1b(B\rover\x08"]) == 2
     shown = capsys.readouterr().err
-    assert f"no run at {tmp_path}/redover/run.sqlite" in shown
+    assert f"no run at {tmp_path}/redover: expected" in shown
     assert not set(shown) & {chr(code) for code in (*range(10), *range(11, 32), *range(127, 160))}
 
 

@@ -142,6 +142,57 @@ def test_what_is_no_number_is_refused_plainly(capsys: pytest.CaptureFixture[str]
         assert message in shown and "no type matching" not in shown
 
 
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        (["episodes", "--episodes", "0"], "expected --episodes of at least 1, got 0"),
+        (["submit", "--shards", "0", "--dry-run"], "expected --shards of at least 1, got 0"),
+        (["scenes", "apartments:val:5:2"], "'apartments:val:5:2': holds no scene; expected first < end"),
+        (["scenes", "apartments:val:1", "--views", "-1"], "expected --views of at least 0, got -1"),
+        (["data", "stats", "nowhere", "--clip", "0"], "expected --clip of at least 1 frame, got 0"),
+        (["compare", "a", "b", "--other", "warp"], "name one of the first with --arm"),
+        (["power", "5", "--pilot", "a"], "or neither; got --pilot"),
+        (["study", "eror"], "data-scaling, errors, front-vs-panorama, models, vlm,"),
+        (["collect", "decisions", "--out", str(FAKES)], "fakes.py already exists"),
+        (["bench", "gpu", "--networks", "warp"], "no network 'warp'"),
+        (["run", "imagenav", "--episode-file", str(FAKES)], "fakes.py: expected an episode file, which is JSON"),
+    ],
+)
+def test_a_mistake_is_explained_before_any_work(
+    arguments: list[str],
+    message: str,
+    tmp_path: Path,
+    capsys: pytest.CaptureFixture[str],
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    assert main(arguments) == 2
+    assert message in capsys.readouterr().err.splitlines()[-1]
+    assert not list(tmp_path.iterdir())
+
+
+def test_a_wrong_flag_brings_hints_of_its_own_command_only(capsys: pytest.CaptureFixture[str]) -> None:
+    for arguments in (["run", "--epsodes", "3"], ["run", "--episodes", "x"]):
+        with pytest.raises(SystemExit) as stop:
+            main(arguments)
+        shown = capsys.readouterr().err
+        assert stop.value.code == 2 and "wiw run --help" in shown and "wiw verify" not in shown
+
+
+def test_half_a_size_is_refused_plainly(capsys: pytest.CaptureFixture[str]) -> None:
+    for size, message in ((["32"], "Expected 2 values"), (["32", "x"], "expected two whole numbers, got '32 x'")):
+        with pytest.raises(SystemExit) as stop:
+            main(["collect", "navigation", "--size", *size])
+        assert stop.value.code == 2 and message in capsys.readouterr().err
+
+
+@pytest.mark.parametrize("command", ["demo", "power", "compare", "report", "serve", "view"])
+def test_help_shows_no_default_of_none(command: str, capsys: pytest.CaptureFixture[str]) -> None:
+    with pytest.raises(SystemExit):
+        main([command, "--help"])
+    assert "default: None" not in " ".join(capsys.readouterr().out.replace("│", " ").split())
+
+
 def test_a_sheet_that_cannot_be_written_is_an_error(two_rooms: str, capsys: pytest.CaptureFixture[str]) -> None:
     assert main(["scenes", two_rooms, "--views", "1", "--out", "/proc/sheet.png"]) == 2
     assert "/proc/sheet.png: cannot be written" in capsys.readouterr().err

@@ -84,7 +84,8 @@ def test_options_of_other_networks_are_refused(
     with pytest.raises(SystemExit) as end:
         main(["train", what, option, value, "--out", str(tmp_path / "x")])
     assert end.value.code == 2
-    assert f"{option} (applied to wiw train {what})" in capsys.readouterr().err
+    shown = capsys.readouterr().err
+    assert f"Unrecognized options: {option}, {value}" in shown and f"wiw train {what} --help" in shown
     assert not list(tmp_path.iterdir())
 
 
