@@ -9,6 +9,7 @@ structure of msgpack, JSON, YAML and GLB takes turns with libFuzzer's own.
 from __future__ import annotations
 
 import random
+import resource
 import signal
 import sys
 from pathlib import Path
@@ -25,6 +26,8 @@ from locations import ROOM_FOLDERS  # noqa: E402
 sys.path.extend(ROOM_FOLDERS)
 
 from readers import READERS, STRUCTURES  # noqa: E402
+
+MOST_BYTES = 3 << 30
 
 
 def instrument(*packages: str) -> None:
@@ -69,7 +72,9 @@ def fuzz(name: str, folder: Path, options: list[str]) -> None:
 
     mutator = {"custom_mutator": mutate} if reader.structure else {}
     signal.signal(signal.SIGINT, signal.default_int_handler)
-    atheris.Setup([sys.argv[0], "-timeout=60", "-rss_limit_mb=3000", *options, str(corpus)], read, **mutator)
+    # A limit of the process's own: libFuzzer's counts what the parent had in memory when it started this process.
+    resource.setrlimit(resource.RLIMIT_DATA, (MOST_BYTES, MOST_BYTES))
+    atheris.Setup([sys.argv[0], "-timeout=60", "-rss_limit_mb=0", *options, str(corpus)], read, **mutator)
     atheris.Fuzz()
 
 

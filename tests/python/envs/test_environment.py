@@ -212,6 +212,7 @@ def test_no_privileged_truth_reaches_policies_or_models(two_rooms: str) -> None:
                         "task",
                         "image",
                         "text",
+                        "budget",
                         "choices",
                         "question",
                     )
