@@ -27,6 +27,8 @@ Read = Callable[[bytes, Path], Any]
 """Reads bytes, for which it may use a folder."""
 Mutate = Callable[[bytes, random.Random], bytes]
 CONFIGS = Path(wiw.__file__).parent / "configs"
+MOST_BYTES = 3 << 30
+"""Memory that a process which reads damaged bytes may take."""
 
 
 @dataclass(frozen=True)

@@ -25,9 +25,7 @@ from locations import ROOM_FOLDERS  # noqa: E402
 
 sys.path.extend(ROOM_FOLDERS)
 
-from readers import READERS, STRUCTURES  # noqa: E402
-
-MOST_BYTES = 3 << 30
+from readers import MOST_BYTES, READERS, STRUCTURES  # noqa: E402
 
 
 def instrument(*packages: str) -> None:

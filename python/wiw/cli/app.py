@@ -288,16 +288,8 @@ def _dispatch(arguments: Sequence[str]) -> Any:
     name, *rest = arguments or ["--help"]
     if name in GROUPS:
         return _dispatch_group(name, rest)
-    for function, known, _ in COMMANDS:
-        if name == known:
-            return _run_command(function, f"wiw {name}", rest)
-    _require_like(name, [known for _, known, _ in COMMANDS] + list(GROUPS), "wiw")
-    app = tyro.extras.SubcommandApp()
-    for function, known, line in COMMANDS:
-        app.command(name=known, help=line)(join_lines(function))
-    for known, group in GROUPS.items():
-        app.command(name=known, help=group.line)(_name_group)
-    return _run_app(app, "wiw", DESCRIPTION, [name, *rest])
+    groups = [(_name_group, known, group.line) for known, group in GROUPS.items()]
+    return _run_app([*COMMANDS, *groups], "wiw", DESCRIPTION, [name, *rest])
 
 
 def _dispatch_group(name: str, arguments: Sequence[str]) -> Any:
@@ -308,14 +300,7 @@ def _dispatch_group(name: str, arguments: Sequence[str]) -> Any:
     is_own = group.default_takes_words or first.startswith("-")
     if group.default and is_own and first not in (*known, "-h", "--help"):
         given = [group.default, *given]
-    for function, each, _ in group.commands:
-        if given[0] == each:
-            return _run_command(function, f"wiw {name} {each}", given[1:])
-    _require_like(given[0], known, f"wiw {name}")
-    app = tyro.extras.SubcommandApp()
-    for function, each, line in group.commands:
-        app.command(name=each, help=line)(join_lines(function))
-    return _run_app(app, f"wiw {name}", group.description, given)
+    return _run_app(group.commands, f"wiw {name}", group.description, given)
 
 
 def _name_group() -> int:
@@ -323,26 +308,28 @@ def _name_group() -> int:
     raise AssertionError("commands of two words are dispatched before")
 
 
-def _require_like(name: str, known: Sequence[str], prog: str) -> None:
-    """Refuse a word that is no command.
+def _run_app(
+    commands: Sequence[tuple[Callable[..., int], str, str]], prog: str, description: str, arguments: Sequence[str]
+) -> Any:
+    """Run a command on its own, so that an error names the flags and the help of no other; or list all of them.
 
     Raises:
-        ArgumentError: the word, with the commands that are like it.
+        ArgumentError: there is no such command.
     """
-    if not name.startswith("-") and name not in known:
-        choices = ", ".join(known)
-        raise ArgumentError(f"no command '{prog} {name}'; expected one of {choices}.{did_you_mean(name, known)}")
-
-
-def _run_app(app: tyro.extras.SubcommandApp, prog: str, description: str, arguments: Sequence[str]) -> Any:
+    name, *rest = arguments
+    functions = {known: function for function, known, _ in commands}
+    if name in functions:
+        command = hide_defaults(join_lines(functions[name]))
+        with _make_rules():
+            return tyro.cli(command, prog=f"{prog} {name}", args=rest, config=CONFIG)
+    if not name.startswith("-"):
+        choices = ", ".join(functions)
+        raise ArgumentError(f"no command '{prog} {name}'; expected one of {choices}.{did_you_mean(name, functions)}")
+    app = tyro.extras.SubcommandApp()
+    for function, known, line in commands:
+        app.command(name=known, help=line)(join_lines(function))
     with _make_rules():
         return app.cli(prog=prog, description=description, args=arguments, config=CONFIG)
-
-
-def _run_command(function: Callable[..., int], prog: str, arguments: Sequence[str]) -> Any:
-    """Run a command on its own, so that an error names the flags and the help of no other."""
-    with _make_rules():
-        return tyro.cli(hide_defaults(join_lines(function)), prog=prog, args=arguments, config=CONFIG)
 
 
 def _make_rules() -> tyro.constructors.ConstructorRegistry:

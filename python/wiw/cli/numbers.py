@@ -8,64 +8,47 @@ from typing import Any, Union, get_args, get_origin
 
 from tyro.constructors import ConstructorRegistry, PrimitiveConstructorSpec, PrimitiveTypeInfo
 
-NOUNS = {int: "a whole number", float: "a number"}
+NOUNS = {int: "a whole number", float: "a number", tuple[int, int]: "two whole numbers"}
 
 
 def make_registry() -> ConstructorRegistry:
-    """Return the coercion rules of the commands for `int`, `float` and pairs of `int`, and their optional forms."""
+    """Return the coercion rule of the commands for `int`, `float` and pairs of `int`, and their optional forms."""
     registry = ConstructorRegistry()
-    registry.primitive_rule(_read_number)
-    registry.primitive_rule(_read_pair)
+    registry.primitive_rule(_read_numbers)
     return registry
 
 
-def _read_number(info: PrimitiveTypeInfo) -> PrimitiveConstructorSpec[Any] | None:
-    kinds = _split_union(info.type)
+def _read_numbers(info: PrimitiveTypeInfo) -> PrimitiveConstructorSpec[Any] | None:
+    kinds = set(get_args(info.type)) if get_origin(info.type) in (Union, UnionType) else {info.type}
     kind = next(iter(kinds - {NoneType}), None) if len(kinds - {NoneType}) == 1 else None
     if kind not in NOUNS:
         return None
+    parts = get_args(kind) or (kind,)
 
     def parse(words: list[str]) -> Any:
         if words == ["None"] and NoneType in kinds:
             return None
         try:
-            return kind(words[0])
+            numbers = tuple(part(word) for part, word in zip(parts, words, strict=True))
         except ValueError:
-            raise ValueError(f"expected {NOUNS[kind]}, got '{words[0]}'") from None
+            raise ValueError(f"expected {NOUNS[kind]}, got '{' '.join(words)}'") from None
+        return numbers if len(parts) > 1 else numbers[0]
+
+    def is_instance(value: Any) -> bool:
+        if value is None:
+            return NoneType in kinds
+        types = tuple(map(type, value)) if len(parts) > 1 and type(value) is tuple else (type(value),)
+        return types == parts or (kind is float and types == (int,))
 
     return PrimitiveConstructorSpec(
-        nargs=1,
-        metavar="N",
+        nargs=len(parts),
+        metavar=" ".join("N" * len(parts)),
         instance_from_str=parse,
-        is_instance=lambda value: type(value) in kinds or (kind is float and type(value) is int),
-        str_from_instance=lambda value: [str(value)],
+        is_instance=is_instance,
+        str_from_instance=lambda value: [
+            str(each) for each in (value if type(value) is tuple else [value] * len(parts))
+        ],
     )
-
-
-def _read_pair(info: PrimitiveTypeInfo) -> PrimitiveConstructorSpec[Any] | None:
-    kinds = _split_union(info.type)
-    if kinds - {NoneType} != {tuple[int, int]}:
-        return None
-
-    def parse(words: list[str]) -> Any:
-        try:
-            return int(words[0]), int(words[1])
-        except ValueError:
-            raise ValueError(f"expected two whole numbers, got '{' '.join(words)}'") from None
-
-    return PrimitiveConstructorSpec(
-        nargs=2,
-        metavar="N N",
-        instance_from_str=parse,
-        is_instance=lambda value: (
-            value is None if type(value) is not tuple else [type(number) for number in value] == [int, int]
-        ),
-        str_from_instance=lambda value: [str(number) for number in value or ("None", "None")],
-    )
-
-
-def _split_union(kind: Any) -> set[Any]:
-    return set(get_args(kind)) if get_origin(kind) in (Union, UnionType) else {kind}
 
 
 def parse_numbers(text: str | None, kind: type[int | float], name: str) -> list[Any] | None:

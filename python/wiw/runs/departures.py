@@ -38,6 +38,7 @@ REVISER = "vlm"
 """The paper's revision policy."""
 SILENT = ("temperature", "revision_temperature", "tries")
 """Options of it that the paper does not name."""
+SERVED = "they are its server's; whether they are the preset's is unknown"
 UNCOUNTED = (*ELSEWHERE, "model", "prompts", "task", "space")
 """Options of policy `vlm` that are not part of the protocol, or are looked at by themselves."""
 
@@ -180,11 +181,7 @@ def _compare_model(task: Task, recipe: AgentRecipe) -> Iterator[Departure]:
         if name in theirs and name != "weights" and to_json(value) != to_json(theirs[name]):
             yield Departure(f"{recipe.model} {name}", f"{value} (preset: {theirs[name]})")
     if str(recipe.model).startswith("remote:") and task.model_options:
-        topic, reason = (
-            "options of a served world model",
-            "they are its server's; whether they are the preset's is unknown",
-        )
-        yield Departure(topic, "", reason)
+        yield Departure("options of a served world model", "", SERVED)
     if recipe.imagine_fraction not in (None, 1):
         yield Departure("decisions with a world model", f"a share of {recipe.imagine_fraction} (paper: all)")
 

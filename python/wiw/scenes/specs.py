@@ -69,16 +69,17 @@ def resolve(spec: str | PathLike[str]) -> list[str]:
         return [spec]
     base, mark, edits = spec.partition("?")
     match = re.fullmatch(APARTMENTS, base)
-    if match is not None and int(match[2] or 0) >= int(match[3] or SPLIT_SIZE):
-        raise ArgumentError(f"scene spec '{spec}': holds no scene; expected first < end, as in apartments:val:40:60.")
     if match is None:
         raise ArgumentError(f"scene spec '{spec}': expected {_FORMS}.{_did_you_mean(base)}")
     split, first, end, index = match.groups()
+    numbers = range(int(first or 0), int(end or SPLIT_SIZE))
+    if not numbers:
+        raise ArgumentError(f"scene spec '{spec}': holds no scene; expected first < end, as in apartments:val:40:60.")
     if index is not None:
         return [base + mark + "&".join(_parse_edits(spec, edits))] if mark else [spec]
     if mark:
         raise ArgumentError(f"scene spec '{spec}': edits belong to a single apartment; expected {_FORMS}.")
-    return [f"apartments:{split}/{i}" for i in range(int(first or 0), int(end or SPLIT_SIZE))]
+    return [f"apartments:{split}/{i}" for i in numbers]
 
 
 def _resembles_generated(spec: str) -> bool:

@@ -129,8 +129,9 @@ def benchmark_device(
     for name, numbers in (("views", views), ("rows", rows)):
         if numbers is not None and (not numbers or min(numbers) < 1):
             raise ArgumentError(f"bench: expected {name} of at least 1, got {list(numbers)}")
-    with suppress(ModuleNotFoundError):  # torch, which is then said not to be installed
-        _require_networks(networks or ())
+    if networks:
+        with suppress(ModuleNotFoundError):  # torch, which is then said not to be installed
+            _require_networks(networks)
     not_run: list[str] = []
     devices = {"cpu": str(describe_platform()["processor"])}
     found: list[Measurement] = []

@@ -210,7 +210,7 @@ class AEQA(NavigationTask):
         return [_describe(episode) for episode in made]
 
     def make_goal(self, place: World, episode: Episode) -> Goal:
-        """Return the question's text, and nothing else of it."""
+        """Return the question's text, nothing else of it, and the budget."""
         return Goal(self.name, text=read_question(episode).text, question=True, budget=self.budget)
 
     def find_goal_position(self, place: World, episode: Episode) -> NDArray[np.float64]:
