@@ -84,7 +84,10 @@ class PoseGrid:
 
     def __post_init__(self) -> None:
         if not all(low < high for low, high in zip(self.low, self.high, strict=True)) or min(self.bins, self.turns) < 1:
-            raise ArgumentError(f"PoseGrid: expected low < high, 3 metres each, and at least one bin, got {self}")
+            raise ArgumentError(
+                f"PoseGrid: expected low < high, 3 metres each, and at least one bin and turn, got {self.low}, "
+                f"{self.high}, {self.bins} and {self.turns}"
+            )
 
     def encode(self, poses: ArrayLike) -> NDArray[np.int64]:
         """Encode float [..., 7] as int64 [..., 7]: positions out of bounds go to the outermost bins, angles to the

@@ -218,7 +218,7 @@ def _find_cause(error: Any) -> Exception:
 def _remake_error(name: str, text: str) -> Error:
     """Return an error from the name of its class."""
     kind = getattr(errors, name, InfrastructureError)
-    return kind(text) if issubclass(kind, Error) else InfrastructureError(text)
+    return kind(text) if isinstance(kind, type) and issubclass(kind, Error) else InfrastructureError(text)
 
 
 def _restore(handler: Any) -> None:

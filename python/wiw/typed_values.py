@@ -45,6 +45,18 @@ def read_values(declared: type, values: Mapping[str, Any], where: str, noun: str
     return {name: _read_value(value, kinds[name], f"{where}: {name}") for name, value in values.items()}
 
 
+def require_positive(where: str, settings: object, *names: str) -> None:
+    """Check that the settings of these names are 1 or more; of a tuple each number counts.
+
+    Raises:
+        ArgumentError: one is not; says where, which, and its value.
+    """
+    for name in names:
+        value = getattr(settings, name)
+        if min(value if isinstance(value, tuple) else (value,)) < 1:
+            raise ArgumentError(f"{where}: {name} must be positive, got {value}")
+
+
 def require_known(names: Iterable[Any], known: Collection[str], where: str, noun: str = "name") -> None:
     """Check that all names are known.
 

@@ -280,8 +280,8 @@ def _build_error(message: Any) -> Exception:
     name, kind = str(message.get("type", "")), message.get("kind")
     if name == "ExitError":
         return ExitError(text)
-    own = getattr(errors, name, None) if name in errors.__all__ and name != "is_stop_request" else None
-    if own is None:
+    own = getattr(errors, name, None) if name in errors.__all__ else None
+    if not (isinstance(own, type) and issubclass(own, errors.Error)):
         return RaisedError(text)
     try:
         error: Exception = own(text, kind) if isinstance(kind, str) else own(text)

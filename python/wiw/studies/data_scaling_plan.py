@@ -13,6 +13,7 @@ import wiw
 from wiw.analysis.data_scaling import EQUAL_UPDATES, FEWER_SCENES, ONE_EPOCH, ScalingArm
 from wiw.errors import ArgumentError
 from wiw.training.learners import LEARNERS
+from wiw.typed_values import require_positive
 
 PRIMARY: Mapping[str, str] = {
     "error": "held-out error after 4 actions, grey levels (RMS)",
@@ -71,8 +72,9 @@ class ScalingSettings:
                 raise ArgumentError(f"data-scaling: expected different {name}, got {few}")
         if self.sizes < 3:
             raise ArgumentError(f"data-scaling: expected at least 3 sizes, for a trend, got {self.sizes}")
-        if min(self.batch, self.held_out_clips, self.decisions_per_scene) < 1 or min(self.seeds) < 0:
-            raise ArgumentError(f"data-scaling: expected numbers of 1 or more and seeds of 0 or more, got {self}")
+        require_positive("data-scaling", self, "batch", "held_out_clips", "decisions_per_scene")
+        if min(self.seeds) < 0:
+            raise ArgumentError(f"data-scaling: expected seeds of 0 or more, got {self.seeds}")
 
 
 FULL = ScalingSettings()

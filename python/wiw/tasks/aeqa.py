@@ -26,6 +26,7 @@ from wiw.judging.judge import HIGHEST_MARK
 from wiw.scenes import is_generated, resolve
 from wiw.tasks.answer_record import CUTS, MARK_METRICS, AnswerRecord, Unanswered, make_reference, map_mark
 from wiw.tasks.navigation import NavigationTask
+from wiw.typed_values import require_positive
 from wiw.types import Episode, Goal, TableSpec, TextAnswer, Wording
 
 HALF_TURN = 8
@@ -56,8 +57,7 @@ class AEQARules:
     motion: Literal["refuse", "slide"]
 
     def __post_init__(self) -> None:
-        if min(self.actions, self.candidates, self.horizon, self.execute) < 1:
-            raise ArgumentError(f"aeqa: actions, candidates, horizon and execute must be positive, got {self}")
+        require_positive("aeqa", self, "actions", "candidates", "horizon", "execute")
 
 
 class AEQA(NavigationTask):

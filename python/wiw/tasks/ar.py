@@ -17,6 +17,7 @@ from wiw.envs.episode_state import EpisodeState
 from wiw.envs.pointing import Pointing
 from wiw.errors import ArgumentError
 from wiw.tasks.navigation import NavigationTask
+from wiw.typed_values import require_positive
 from wiw.types import Answer, Episode, Goal, Wording
 
 
@@ -45,8 +46,9 @@ class ARRules:
     motion: Literal["refuse", "slide"]
 
     def __post_init__(self) -> None:
-        if min(self.decisions, self.candidates, self.horizon) < 1 or self.box_scale <= 0:
-            raise ArgumentError(f"ar: decisions, candidates, horizon and box_scale must be positive, got {self}")
+        require_positive("ar", self, "decisions", "candidates", "horizon")
+        if self.box_scale <= 0:
+            raise ArgumentError(f"ar: box_scale must be positive, got {self.box_scale}")
         if not 0 <= self.confidence <= 1:
             raise ArgumentError(f"ar: confidence: expected a probability from 0 to 1, got {self.confidence}")
 

@@ -19,6 +19,7 @@ from wiw.envs.episode_state import EpisodeState
 from wiw.errors import ArgumentError, FileError
 from wiw.metrics import path_efficiency
 from wiw.tasks.navigation import NavigationTask
+from wiw.typed_values import require_positive
 from wiw.types import Episode, Goal, Wording
 
 GOAL_SIZE, GOAL_HFOV = (480, 480), 90.0
@@ -49,8 +50,9 @@ class ImageNavRules:
     motion: Literal["refuse", "slide"]
 
     def __post_init__(self) -> None:
-        if min(self.decisions, self.candidates, self.horizon) < 1 or self.radius <= 0:
-            raise ArgumentError(f"imagenav: decisions, candidates, horizon and radius must be positive, got {self}")
+        require_positive("imagenav", self, "decisions", "candidates", "horizon")
+        if self.radius <= 0:
+            raise ArgumentError(f"imagenav: radius must be positive, got {self.radius}")
 
 
 class ImageNav(NavigationTask):

@@ -23,6 +23,7 @@ from wiw.tabletop.tasks import TABLETOP_TASKS
 from wiw.tabletop.workbench import CAMERAS, TABLE, Workbench
 from wiw.tasks import presets
 from wiw.tasks.base import Task
+from wiw.typed_values import require_positive
 from wiw.types import GRIPPER_POSES, ArmObservation, Episode, Wording, check_seed
 
 WALKING = ("scenes", "per_scene", "episode_file", "scene_folder", "motion")
@@ -47,8 +48,7 @@ class ManipulationRules:
     """Default number of episodes per task."""
 
     def __post_init__(self) -> None:
-        if min(self.actions, self.candidates, self.horizon, self.episodes) < 1:
-            raise ArgumentError(f"manipulation: actions, candidates, horizon and episodes must be positive, got {self}")
+        require_positive("manipulation", self, "actions", "candidates", "horizon", "episodes")
 
 
 class Manipulation(ManipulationSpec, Task):

@@ -19,6 +19,7 @@ from wiw.networks import has_bfloat16
 from wiw.training.checkpoint import Checkpoint, ResumableTrainer
 from wiw.training.plays import POSES, Plays
 from wiw.training.trainer import apply_gradients, run_training, warmup_cosine_schedule
+from wiw.typed_values import require_positive
 from wiw.world_models.armnet.body import render_bare_table
 from wiw.world_models.armnet.motion import motion as motion_of
 from wiw.world_models.armnet.network import (
@@ -80,8 +81,9 @@ class Recipe:
     seed: int = 0
 
     def __post_init__(self) -> None:
-        if min(self.epochs, self.batch, *self.widths) < 1 or not 1 <= self.steps <= POSES:
-            raise ArgumentError(f"Recipe: expected positive epochs, batch, widths and steps up to {POSES}, got {self}")
+        require_positive("Recipe", self, "epochs", "batch", "widths", "steps")
+        if self.steps > POSES:
+            raise ArgumentError(f"Recipe: expected at most {POSES} steps, got {self.steps}")
 
 
 def train(

@@ -51,12 +51,13 @@ class DecisionRules:
         if not 2 <= self.plans <= HEADINGS or self.least_steps < 1 or self.actions < HEADINGS // 2 + self.least_steps:
             raise ArgumentError(
                 f"decisions: expected 2 to {HEADINGS} plans, least_steps of 1 or more, and at least "
-                f"{HEADINGS // 2} actions more than least_steps, so that any heading can be turned to; got {self}"
+                f"{HEADINGS // 2} actions more than least_steps, so that any heading can be turned to; got "
+                f"{self.plans} plans, least_steps {self.least_steps} and {self.actions} actions"
             )
         if not 0 < self.goal_shortest < self.goal_longest or min(self.size) < 16:
             raise ArgumentError(
                 "decisions: expected 0 < goal_shortest < goal_longest, and panoramas of at least 16 rows and columns, "
-                f"got {self}"
+                f"got {self.goal_shortest}, {self.goal_longest} and {self.size[0]} x {self.size[1]}"
             )
 
 

@@ -26,6 +26,7 @@ from wiw.policies.diffuser.paths import MIDDLE, to_vectors
 from wiw.policies.diffuser.workspace import PinholeCamera, WorkspaceView, stack_views
 from wiw.training.checkpoint import Checkpoint, ResumableTrainer
 from wiw.training.trainer import apply_gradients, run_training, warmup_cosine_schedule
+from wiw.typed_values import require_positive
 
 if TYPE_CHECKING:
     from wiw.datasets.demonstrations import Demonstration
@@ -102,8 +103,7 @@ class Recipe:
     seed: int = 0
 
     def __post_init__(self) -> None:
-        if min(self.epochs, self.batch, self.levels, self.width, self.layers) < 1:
-            raise ArgumentError(f"Recipe: epochs, batch, levels, width and layers must be positive, got {self}")
+        require_positive("Recipe", self, "epochs", "batch", "levels", "width", "layers")
 
 
 def extract_samples(

@@ -52,8 +52,9 @@ class NavigationRules:
         for name in positive:
             if not 0 < getattr(self, name) < float("inf"):
                 raise ArgumentError(f"collect: expected {name} above 0, got {getattr(self, name)}")
-        if self.mean_weight < 0 or self.min_island_area < 0:
-            raise ArgumentError(f"collect: expected mean_weight and min_island_area of 0 or more, got {self}")
+        for name in ("mean_weight", "min_island_area"):
+            if getattr(self, name) < 0:
+                raise ArgumentError(f"collect: expected {name} of 0 or more, got {getattr(self, name)}")
         if not 11.25 <= self.turn_threshold_deg <= 45:
             raise ArgumentError(
                 f"collect: expected a turn_threshold_deg from 11.25 to 45, got {self.turn_threshold_deg}"

@@ -29,6 +29,7 @@ from wiw.training.gather import gather_goal_places, require_held_out
 from wiw.training.goal_places import GoalPlaces, PlaceRules
 from wiw.training.preparation import PREPARATION, Preparation, ProgressBar, show_no_bar
 from wiw.training.trainer import apply_gradients, run_training, warmup_cosine_schedule
+from wiw.typed_values import require_positive
 
 NEAR, FAR = 2.0, 9.0
 """Metres: below the first a goal counts as near; pairs farther apart than the second are not evaluated."""
@@ -71,10 +72,7 @@ class Recipe:
     seed: int = 0
 
     def __post_init__(self) -> None:
-        if min(self.epochs, self.scenes, self.places, self.cluster, self.width, self.heads) < 1:
-            raise ArgumentError(
-                f"Recipe: epochs, scenes, places, cluster, width and heads must be positive, got {self}"
-            )
+        require_positive("Recipe", self, "epochs", "scenes", "places", "cluster", "width", "heads")
 
 
 def make_weights(

@@ -34,6 +34,7 @@ from wiw.training.view_batches import (
     degrade_views,
     sample_batch,
 )
+from wiw.typed_values import require_positive
 
 LEAST_CELLS = 40
 """Cells that an object must fill for its state to be evaluated."""
@@ -73,8 +74,7 @@ class Recipe:
     seed: int = 0
 
     def __post_init__(self) -> None:
-        if min(self.epochs, self.batch, *self.widths) < 1:
-            raise ArgumentError(f"Recipe: epochs, batch and widths must be positive, got {self}")
+        require_positive("Recipe", self, "epochs", "batch", "widths")
         if not (self.rate > 0 and np.isfinite(self.rate)):
             raise ArgumentError(f"Recipe: expected a finite learning rate above 0, got {self.rate}")
 

@@ -32,6 +32,7 @@ from wiw.training.glimpse_sets import (
 )
 from wiw.training.preparation import PREPARATION, Preparation, ProgressBar, show_no_bar
 from wiw.training.trainer import run_training, warmup_cosine_schedule
+from wiw.typed_values import require_positive
 
 REAL_COLUMN = 4
 """Column of `Glimpses.scalars` that marks real glimpses."""
@@ -68,8 +69,7 @@ class Recipe:
     seed: int = 0
 
     def __post_init__(self) -> None:
-        if min(self.epochs, self.batch, self.width) < 1:
-            raise ArgumentError(f"Recipe: epochs, batch and width must be positive, got {self}")
+        require_positive("Recipe", self, "epochs", "batch", "width")
 
 
 def make_weights(

@@ -51,8 +51,9 @@ class Collection:
     """Renderer; images of different ones differ slightly."""
 
     def __post_init__(self) -> None:
-        if self.episodes < 1 or self.seed < 0:
-            raise ArgumentError(f"collect: expected 1 episode or more and a seed of 0 or more, got {self}")
+        for name, least in (("episodes", 1), ("seed", 0)):
+            if getattr(self, name) < least:
+                raise ArgumentError(f"collect: expected {name} of {least} or more, got {getattr(self, name)}")
         if not 16 <= self.size <= 4096:
             raise ArgumentError(f"collect: expected a size from 16 to 4096 pixels, got {self.size}")
         if self.frames <= POSES:

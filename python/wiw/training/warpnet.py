@@ -24,6 +24,7 @@ from wiw.training.preparation import PREPARATION, Preparation, ProgressBar, show
 from wiw.training.reduced_frames import compute_log_distances
 from wiw.training.trainer import apply_gradients, run_training, warmup_cosine_schedule
 from wiw.training.walks import WalkRules, Walks, find_straight_paths
+from wiw.typed_values import require_positive
 from wiw.world_models.warpnet.model import WarpNet, to_network
 from wiw.world_models.warpnet.network import Network, Prediction
 from wiw.world_models.warpnet.weights import load, save
@@ -58,8 +59,7 @@ class Recipe:
     seed: int = 0
 
     def __post_init__(self) -> None:
-        if min(self.epochs, self.batch, *self.widths) < 1:
-            raise ArgumentError(f"Recipe: epochs, batch and widths must be positive, got {self}")
+        require_positive("Recipe", self, "epochs", "batch", "widths")
 
 
 def make_weights(

@@ -11,7 +11,7 @@ from typing import Any, Literal
 import pytest
 
 from wiw.errors import ArgumentError
-from wiw.typed_values import read_values
+from wiw.typed_values import read_values, require_positive
 
 
 @dataclass
@@ -84,3 +84,11 @@ def test_an_unknown_name_is_refused_with_what_is_like_it() -> None:
         ArgumentError, match=r"^here: unknown rule 'size_'; expected one of count, .*\. Did you mean sizes? or"
     ):
         read_values(Declared, {"count": 1, "size_": 1}, "here", "rule")
+
+
+def test_settings_below_one_are_named() -> None:
+    require_positive("here", Declared(count=1, sizes=(1, 2)), "count", "sizes")
+    with pytest.raises(ArgumentError, match=r"^here: count must be positive, got 0$"):
+        require_positive("here", Declared(sizes=(1,)), "sizes", "count")
+    with pytest.raises(ArgumentError, match=r"^here: sizes must be positive, got \(1, -2\)$"):
+        require_positive("here", Declared(sizes=(1, -2)), "sizes")

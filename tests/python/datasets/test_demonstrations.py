@@ -323,7 +323,7 @@ def test_the_command_line(tmp_path: Path, capsys: pytest.CaptureFixture[str]) ->
 @pytest.mark.parametrize(
     ("asked", "words"),
     [
-        ({"episodes": 0}, "1 episode or more"),
+        ({"episodes": 0}, "expected episodes of 1 or more, got 0"),
         ({"seed": -1}, "seed of 0 or more"),
         ({"size": 8}, "16 to 4096"),
         ({"frames": 15}, "over 15 frames"),

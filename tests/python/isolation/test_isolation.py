@@ -27,6 +27,7 @@ from wiw.action import FORWARD
 from wiw.errors import ArgumentError, ConstructionError, ContractError, RegistryError, RolloutError
 from wiw.isolation.failures import EndedError, ExitError, LateError, RaisedError
 from wiw.isolation.models import IsolatedModel
+from wiw.isolation.process import _build_error
 from wiw.loop import attempts
 from wiw.loop.attempts import Attempted, make_model
 from wiw.policies.base import Situation
@@ -413,3 +414,9 @@ def test_a_small_dev_shm_is_enough(tmp_path):
     environment = {**os.environ, "PYTHONPATH": os.pathsep.join(sys.path)}
     said = subprocess.check_output(command, cwd=tmp_path, env=environment, text=True, timeout=120)
     assert said.split() == [str(15 * 480 * 960 * 3), str(64 << 10)]
+
+
+@pytest.mark.parametrize("name", ["find_raising_line", "is_stop_request", "KeyboardInterrupt", "__doc__"])
+def test_a_child_names_no_other_things_than_errors(name: str) -> None:
+    """What a child reports is data: only names of wiw's exceptions are followed."""
+    assert type(_build_error({"type": name, "text": "no"})) is RaisedError

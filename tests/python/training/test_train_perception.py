@@ -274,8 +274,10 @@ def test_changed_states_can_all_be_had_together() -> None:
 
 
 def test_recipes_are_checked() -> None:
-    with pytest.raises(ArgumentError, match="epochs, batch and widths must be positive"):
+    with pytest.raises(ArgumentError, match="Recipe: epochs must be positive, got 0"):
         Recipe(epochs=0)
+    with pytest.raises(ArgumentError, match=r"Recipe: widths must be positive, got \(8, 0\)"):
+        Recipe(widths=(8, 0))
     for rate in (0.0, float("nan")):
         with pytest.raises(ArgumentError, match="expected a finite learning rate above 0"):
             Recipe(rate=rate)

@@ -19,6 +19,7 @@ from wiw.policies.diffuser.attention import RelativeAttention
 from wiw.policies.diffuser.diffusion import NOISE_LEVELS
 from wiw.policies.diffuser.paths import MIDDLE, SCALE
 from wiw.policies.diffuser.workspace import CELL, WorkspaceView
+from wiw.typed_values import require_positive
 
 
 @dataclass(frozen=True)
@@ -41,8 +42,12 @@ class Shape:
     """Whether scenes are seen by the wrist camera, too."""
 
     def __post_init__(self) -> None:
-        if min(self.width, self.heads, self.layers, self.tokens, self.poses) < 1 or self.width % (6 * self.heads):
-            raise ArgumentError(f"diffuser: expected numbers from 1 and a width of 6 heads times something, got {self}")
+        require_positive("diffuser", self, "width", "heads", "layers", "tokens", "poses")
+        if self.width % (6 * self.heads):
+            raise ArgumentError(
+                f"diffuser: expected a width divisible by 6 times the number of heads, got {self.width} with "
+                f"{self.heads} heads"
+            )
 
 
 @dataclass(frozen=True)

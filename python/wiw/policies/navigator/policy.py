@@ -28,7 +28,7 @@ from wiw.policies.navigator.candidates import Candidate, choose_apart, list_cand
 from wiw.policies.navigator.estimator import GoalEstimator, require_torch
 from wiw.policies.navigator.way_cells import WayCells
 from wiw.policies.navigator.ways import WayMap, Ways
-from wiw.typed_values import read_values
+from wiw.typed_values import read_values, require_positive
 from wiw.types import Goal, Key, Proposal, Rollout
 
 if TYPE_CHECKING:
@@ -73,13 +73,16 @@ class NavigatorOptions:
     """Maximum number of places that routes are planned to."""
 
     def __post_init__(self) -> None:
-        if min(self.patience, self.overlap) <= 0 or self.targets < 1 or min(vars(self).values()) < 0:
-            raise ArgumentError(
-                "policy navigator: expected patience and overlap above 0, at least 1 target and no negative number, "
-                f"got {self}"
-            )
+        require_positive("policy navigator", self, "targets")
+        for name, value in vars(self).items():
+            if value < 0 or (value == 0 and name in ("patience", "overlap")):
+                least = "above 0" if name in ("patience", "overlap") else "of 0 or more"
+                raise ArgumentError(f"policy navigator: expected {name} {least}, got {value}")
         if not (self.doubt < 1 and self.commitment <= 1):
-            raise ArgumentError(f"policy navigator: expected doubt below 1 and commitment of at most 1, got {self}")
+            raise ArgumentError(
+                "policy navigator: expected doubt below 1 and commitment of at most 1, got "
+                f"{self.doubt} and {self.commitment}"
+            )
 
 
 @dataclass

@@ -10,6 +10,7 @@ from typing import Any, Literal
 
 from wiw.action import Action
 from wiw.errors import ArgumentError, WeightsError
+from wiw.typed_values import require_positive
 
 FILE = "config.json"
 
@@ -43,8 +44,9 @@ class ActionConfig:
         for name in ("vocabulary", "low", "high"):
             value = getattr(self, name)
             object.__setattr__(self, name, None if value is None else tuple(value))
-        if self.kind not in ("discrete", "pose7") or min(self.width, self.stride) < 1:
-            raise ArgumentError(f"ActionConfig: expected kind discrete or pose7, width and stride >= 1, got {self}")
+        if self.kind not in ("discrete", "pose7"):
+            raise ArgumentError(f"ActionConfig: expected kind discrete or pose7, got {self.kind!r}")
+        require_positive("ActionConfig", self, "width", "stride")
         if self.kind == "discrete" and set(self.vocabulary) != {action.name.lower() for action in Action}:
             raise ArgumentError(
                 f"ActionConfig: vocabulary: expected {', '.join(a.name.lower() for a in Action)} in some order, got "
