@@ -5,11 +5,17 @@ from __future__ import annotations
 
 import os
 import shutil
+import time
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager, suppress
+from functools import cache
+from hashlib import sha256
 from pathlib import Path
 
 from wiw.errors import FileError
+
+ABANDONED = 86_400.0
+"""Seconds after which an unchanged draft is abandoned, where its writer may be on another machine."""
 
 
 @contextmanager
@@ -17,9 +23,12 @@ def atomic_file(path: Path) -> Iterator[Path]:
     """Yield a temporary file beside `path`, which replaces `path` once it is complete.
 
     Raises:
-        FileError: it cannot be written, for instance because the disk is full; `path` is as it was.
+        FileError: it cannot be written, for instance because the disk is full or `path` is a folder; `path` is as it
+            was.
     """
-    draft = path.with_name(f".{path.name}.{os.getpid()}.part")
+    if path.is_dir():
+        raise FileError(f"{path} is a folder; expected a file to write: add a file name")
+    draft = _draft(path)
     with _write_draft(path, draft):
         path.parent.mkdir(parents=True, exist_ok=True)
         remove_abandoned_drafts(path.parent, path.name)
@@ -53,7 +62,7 @@ def atomic_folder(path: Path, replace: Callable[[Path], bool] = lambda folder: F
     """
     if path.exists() and (not path.is_dir() or (any(path.iterdir()) and not replace(path))):
         raise FileError(f"{path} is not empty; expected a new or empty folder: choose another")
-    draft = path.with_name(f".{path.name}.{os.getpid()}.part")
+    draft = _draft(path)
     with _write_draft(path, draft):
         path.parent.mkdir(parents=True, exist_ok=True)
         remove_abandoned_drafts(path.parent, path.name)
@@ -86,16 +95,42 @@ def _is_of_system(error: Exception) -> bool:
     return own or isinstance(error, OSError)
 
 
+def _draft(path: Path) -> Path:
+    """Return the temporary path beside `path` that no other process on any machine uses."""
+    return path.with_name(f".{path.name}.{_place()}-{os.getpid()}.part")
+
+
 def _old(path: Path) -> Path:
     """Return where a replaced folder stays until the new one is in place."""
-    return path.with_name(f".{path.name}.old.{os.getpid()}.part")
+    return path.with_name(f".{path.name}.old.{_place()}-{os.getpid()}.part")
+
+
+@cache
+def _place() -> str:
+    """Return a short name of what process ids belong to: this machine since it was started, and a container of it."""
+    known = os.uname().nodename
+    with suppress(OSError):  # some sandboxes hide these
+        known += Path("/proc/sys/kernel/random/boot_id").read_text() + str(Path("/proc/self/ns/pid").readlink())
+    return sha256(known.encode()).hexdigest()[:8]
 
 
 def remove_abandoned_drafts(folder: Path, name: str = "*") -> None:
-    """Remove the temporary files that killed writers of files of such a name have left in a folder."""
+    """Remove the temporary files that killed writers of files of such a name have left in a folder.
+
+    Those of another machine that shares the folder, or from before a restart, go once they have not changed for a day.
+    """
     for draft in folder.glob(f".{name}.*.part"):
-        if not _runs(draft.name.removesuffix(".part").rpartition(".")[2]):
+        place, _, pid = draft.name.removesuffix(".part").rpartition(".")[2].partition("-")
+        if not _runs(pid) if place == _place() else time.time() - _last_change(draft) > ABANDONED:
             _remove(draft)
+
+
+def _last_change(draft: Path) -> float:
+    """Return when a file or anything in a folder was changed last; infinity if it is gone."""
+    try:
+        return max(each.stat().st_mtime for each in (draft, *draft.rglob("*")))
+    except OSError:
+        return float("inf")
 
 
 def _runs(pid: str) -> bool:

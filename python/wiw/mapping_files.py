@@ -30,6 +30,8 @@ def read_yaml_mapping(path: Path, expected: str) -> dict[str, Any]:
 
     try:
         content = parse_yaml(path.read_text(encoding="utf-8"))
+    except FileNotFoundError as error:
+        raise FileError(f"{path} does not exist; expected {expected}") from error
     except (OSError, ValueError, yaml.YAMLError) as error:
         raise FileError(f"{path}: expected {expected}, got {error}") from error
     if not isinstance(content, dict):

@@ -229,8 +229,16 @@ def _check(
         (difference != 0, f"a difference other than 0, got {difference:g}"),
         (0 <= base <= 100, f"base from 0 to 100 %, got {base:g}"),
         (losses >= 0, f"losses of at least 0 %, got {losses:g}"),
-        (only_base <= base, f"at most the base's {base:g} % of episodes lost, got {only_base:g} %"),
-        (only_arm <= 100 - base, f"at most the {100 - base:g} % in which the base fails won, got {only_arm:g} %"),
+        (
+            only_base <= base,
+            f"a smaller difference or another base: {difference:+g} points mean that {only_base:g} % are lost, but the "
+            f"base succeeds only in {base:g} %",
+        ),
+        (
+            only_arm <= 100 - base,
+            f"a smaller difference or another base: {difference:+g} points mean that {only_arm:g} % are won, but the "
+            f"base fails only in {100 - base:g} %",
+        ),
         (0 <= correlation < 1, f"correlation in [0, 1), got {correlation:g}"),
         (per_scene >= 1, f"per_scene of at least 1, got {per_scene}"),
         (0 < chance < 1, f"chance between 0 and 1, got {chance:g}"),

@@ -40,8 +40,9 @@ def report(
     from wiw.studies.run_log import load_run
 
     log = load_run(run, judge)
+    written = log.report(out, episodes=episodes, max_mb=max_mb)
     log.summary()
     print_costs(log)
     print_fidelity(log)
-    print(f"\nreport  {log.report(out, episodes=episodes, max_mb=max_mb)}")
+    print(f"\nreport  {written}")
     return 0

@@ -40,8 +40,10 @@ Point = tuple[float, float]
 
 
 class Flow(FrameTracker):
-    """Finds the target's patch again by correlation, follows its corners by pyramidal Lucas-Kanade there and back
-    (Kalal et al., ICPR 2010), and moves the mask by the similarity that most of them agree on.
+    """Finds the target's patch again by correlation, follows its corners by optical flow, and moves its mask with them.
+
+    Flow is pyramidal Lucas-Kanade, there and back (Kalal et al., ICPR 2010); the mask moves by the similarity that most
+    corners agree on.
 
     Each frame is compared with the one that showed the target last, and then with the seed. Where too few corners agree
     or the moved target differs from the frame, the target is lost. Nothing is learned, and parts that come into sight

@@ -13,7 +13,7 @@ from wiw.perception.sam2 import WEIGHTS, Sam2
 
 
 def make_frame_tracker(**options: Any) -> FrameTracker:
-    """Track the target by the frames' pixels: with SAM 2 if its weights are on this machine, otherwise by optical flow.
+    """Tracks the target in the frames: with SAM 2 if its weights are on this machine, otherwise by optical flow.
 
     Args:
         options: of `Sam2`, which is meant then; its weights are downloaded if need be.

@@ -35,9 +35,11 @@ def export(run: Run, csv: Path | None = None, parquet: Path | None = None, rerun
         rerun: recording for the Rerun viewer.
 
     Raises:
-        ArgumentError: nothing is requested, or a package that it needs is not installed.
+        ArgumentError: nothing is requested, the recording does not end in .rrd, or a package is not installed.
         FileError: a folder holds something already, or cannot be written.
     """
+    if rerun is not None and rerun.suffix != ".rrd":
+        raise ArgumentError(f"export: expected a recording's name to end in .rrd, got {rerun}")
     if csv is None and parquet is None and rerun is None:
         raise ArgumentError("export: expected at least one of csv (--csv DIR), parquet and rerun (--rerun FILE.rrd)")
     written = [] if csv is None else export_csv(run, csv)

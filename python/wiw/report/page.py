@@ -52,6 +52,8 @@ def write_report(
     """
     if episodes is not None and episodes < 0:
         raise ArgumentError(f"report: expected episodes of at least 0, got {episodes}")
+    if max_mb is not None and not max_mb > 0:
+        raise ArgumentError(f"report: expected max_mb above 0, got {max_mb}")
     page = render(run, episodes, remark=remark) if max_mb is None else _render_within(run, episodes, max_mb, remark)
     with atomic_file(path) as draft:
         draft.write_text(page, encoding="utf-8")

@@ -84,12 +84,15 @@ class Settings:
     grace: float = 30.0
 
     def __post_init__(self) -> None:
-        least = 1 if self.queue is None else self.queue
-        if not 0 <= self.port < 2**16 or least < 1 or self.window < 0 or self.grace < 0:
-            raise ArgumentError(
-                "serve: expected a port below 65536, a queue of at least 1, and a window and a grace of at least 0, "
-                f"got port={self.port}, queue={self.queue}, window={self.window}, grace={self.grace}"
-            )
+        expectations = (
+            (0 <= self.port < 2**16, f"a port from 0 to 65535, got {self.port}"),
+            (self.queue is None or self.queue >= 1, f"a queue of at least 1, got {self.queue}"),
+            (self.window >= 0, f"a window of at least 0, got {self.window}"),
+            (self.grace >= 0, f"a grace of at least 0 seconds, got {self.grace}"),
+        )
+        for holds, expected in expectations:
+            if not holds:
+                raise ArgumentError(f"serve: expected {expected}")
         if not self.token and not is_loopback(self.host):
             raise ArgumentError(
                 f"serve: {self.host} can be reached from other machines: set WIW_TOKEN (or --token) to a secret that "

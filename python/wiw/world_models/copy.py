@@ -37,7 +37,7 @@ class CopyFront(Copy):
 
 
 def make_copy(space: str = PRIMITIVES) -> Copy:
-    """Return the floor, which predicts that every future frame equals the observation."""
+    """Predict that every future frame equals the observation: the floor for other models."""
     made = {PRIMITIVES: Copy, GRIPPER_POSES: CopyFront}.get(space)
     if made is None:
         raise ArgumentError(

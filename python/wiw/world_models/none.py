@@ -3,5 +3,5 @@
 
 
 def none() -> None:
-    """Act without a world model: the same loop without imagination. Return None."""
+    """Act without a world model: the same loop, without imagination."""
     return

@@ -100,8 +100,8 @@ def test_several_arms_are_reckoned_with_as_holm_does():
     ("numbers", "message"),
     [
         ({"difference": 0}, "a difference other than 0"),
-        ({"difference": 90}, "at most the 80 % in which the base fails won, got 92 %"),
-        ({"difference": -30}, "at most the base's 20 % of episodes lost, got 32 %"),
+        ({"difference": 90}, "+90 points mean that 92 % are won, but the base fails only in 80 %"),
+        ({"difference": -30}, "-30 points mean that 32 % are lost, but the base succeeds only in 20 %"),
         ({"difference": 10, "correlation": 1.0}, "correlation in [0, 1)"),
         ({"difference": 10, "chance": 1.0}, "chance between 0 and 1"),
         ({"difference": 0.01}, "more than 100000 scenes"),

@@ -19,6 +19,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 import wiw
+from wiw import files
 from wiw.cli import main
 from wiw.datasets import shards
 from wiw.datasets.demonstration import decode_colors, decode_depths
@@ -271,10 +272,11 @@ def test_a_killed_collection_goes_on_and_ends_as_any_other(collected: Path, tmp_
     os.kill(process.pid, signal.SIGKILL)
     process.wait()
     _gone(process.pid)
-    (tmp_path / f".slide_block-00000.parquet.{process.pid}.part").write_bytes(b"half")
+    draft = tmp_path / f".slide_block-00000.parquet.{files._place()}-{process.pid}.part"
+    draft.write_bytes(b"half")
     assert len(Demonstrations(tmp_path, partial=True)) == len(list(tmp_path.glob("*.parquet")))
     wiw.collect(tmp_path, TASKS, **WHOLE)
-    assert contents(tmp_path) == contents(collected)
+    assert contents(tmp_path) == contents(collected) and not draft.exists()
 
 
 def _gone(session: int) -> None:

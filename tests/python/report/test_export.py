@@ -105,6 +105,12 @@ def test_missing_packages_are_named_with_the_command(log, tmp_path, monkeypatch,
     assert "pip install rerun-sdk" in capsys.readouterr().err and list(tmp_path.iterdir()) == []
 
 
+def test_a_recording_has_the_ending_that_the_viewer_opens(log, tmp_path):
+    with pytest.raises(ArgumentError, match=r"name to end in \.rrd, got .*run\.txt"):
+        log.export(csv=tmp_path / "tables", rerun=tmp_path / "run.txt")
+    assert list(tmp_path.iterdir()) == []
+
+
 def test_something_must_be_asked_for(log, capsys):
     assert main(["export", str(log.path)]) == 2
     assert "--csv DIR" in capsys.readouterr().err

@@ -135,6 +135,8 @@ def test_a_report_of_limited_size_shrinks_pictures_and_then_leaves_out_episodes(
     assert count_stories(bare) == 0
     with pytest.raises(ArgumentError, match="tables and plots alone take"):
         log.report(tmp_path / "no.html", max_mb=(sizes[0, 1.0] - 1) / 1e6)
+    with pytest.raises(ArgumentError, match="expected max_mb above 0, got -1"):
+        log.report(tmp_path / "no.html", max_mb=-1)
     with pytest.raises(ArgumentError, match="episodes of at least 0"):
         log.report(tmp_path / "no.html", episodes=-1)
     assert not (tmp_path / "no.html").exists()

@@ -378,7 +378,7 @@ def test_specs_name_the_scans_of_a_folder(tmp_path: Path) -> None:
     room = files.write_replica(tmp_path / "replica")
     assert scenes.resolve(f"replica:{tmp_path / 'replica'}") == [str(room)]
     assert scenes.absolute("hm3d:there:val") == f"hm3d:{Path.cwd() / 'there'}:val"
-    with pytest.raises(FileError, match=r"train: no such folder; there is val"):
+    with pytest.raises(FileError, match=r"train: no such folder; expected a dataset of scans .*; there is val"):
         scenes.resolve(f"hm3d:{tmp_path / 'hm3d'}:train")
     with pytest.raises(FileError, match="holds no scan; expected Replica's"):
         scenes.resolve(f"replica:{tmp_path}")

@@ -567,6 +567,22 @@ def test_more_clients_than_a_server_takes(monkeypatch):
         client.close()
 
 
+@pytest.mark.parametrize(
+    ("given", "expected"),
+    [
+        ({"port": -1}, "a port from 0 to 65535, got -1"),
+        ({"port": 65536}, "a port from 0 to 65535, got 65536"),
+        ({"queue": 0}, "a queue of at least 1, got 0"),
+        ({"window": -0.1}, "a window of at least 0, got -0.1"),
+        ({"grace": float("nan")}, "a grace of at least 0 seconds, got nan"),
+    ],
+)
+def test_only_what_is_out_of_range_is_named(given, expected):
+    with pytest.raises(ArgumentError) as error:
+        Settings(**given)
+    assert str(error.value) == f"serve: expected {expected}"
+
+
 def test_a_port_that_is_taken():
     with serve_in_background(Plain()) as server:
         port = int(server.address.rpartition(":")[2])

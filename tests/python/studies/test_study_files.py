@@ -177,7 +177,7 @@ def test_studies_are_listed_taught_and_looked_up(capsys: Any, tmp_path: Path) ->
     assert main(["study", "modles"]) == 2 and "Did you mean models?" in capsys.readouterr().err
     assert main(["study", "vlm", "--set", "servr=x"]) == 2 and "Did you mean server?" in capsys.readouterr().err
     assert main(["study", "vlm", "--set", "server"]) == 2 and "expected NAME=VALUE" in capsys.readouterr().err
-    with pytest.raises(FileError, match="expected a study"):
+    with pytest.raises(FileError, match=r"nowhere.yaml does not exist; expected a study"):
         load_study(tmp_path / "nowhere.yaml")
 
 

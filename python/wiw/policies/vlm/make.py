@@ -13,7 +13,7 @@ from wiw.types import GRIPPER_POSES, PRIMITIVES
 
 
 def make_vlm(space: str = PRIMITIVES, task: str = "", **options: Any) -> VLM:
-    """Ask a vision-language model for plans, scores and answers (any OpenAI-compatible server, or a local model).
+    """Asks a vision-language model for plans, scores and answers (any OpenAI-compatible server, or a local model).
 
     `VLM` documents the options, and `QuestionVLM` those of task "aeqa".
     """

@@ -155,7 +155,10 @@ def require_folder(folder: Path, split: str) -> Path:
     place = folder / split
     if not place.is_dir():
         there = sorted(entry.name for entry in folder.iterdir() if entry.is_dir()) if folder.is_dir() else []
-        raise FileError(f"{place}: no such folder{'; there is ' + ', '.join(there[:20]) if there else ''}")
+        raise FileError(
+            f"{place}: no such folder; expected a dataset of scans with its own layout, see docs/real-scans.md"
+            f"{'; there is ' + ', '.join(there[:20]) if there else ''}"
+        )
     return place
 
 

@@ -27,7 +27,7 @@ ROBOT = {"name": "panda"}
 
 
 class ArmNet(Trained):
-    """Draws the arm at each pose, which it knows, and guesses what becomes of the things, which it has learnt.
+    """Draw the arm at each pose, which is known, and predict what happens to the objects, which is learned.
 
     A network composes each pixel of the next view of what is seen there now, of what is carried along with the gripper,
     of the arm over the bare table, and of new paint; then goes on from there. The first three are in full resolution.
