@@ -12,11 +12,11 @@ namespace wiw::apartment {
 namespace {
 
 constexpr float kTurn = 6.2831853f;
-constexpr float kLift = 0.004f;       // of samples above their surface
-constexpr int kBouncePackets = 4;     // of 16 rays a sample
-constexpr float kLampRadius = 0.14f;  // of the ball that stands for a lamp, for soft shadows
-constexpr float kSoftening = 0.12f;   // square metres added to squared distances: no hot spots beside lamps
-constexpr std::size_t kBlock = 256;   // samples a job
+constexpr float kLift = 0.004f;            // of samples above their surface
+constexpr std::size_t kBouncePackets = 4;  // of 16 rays a sample
+constexpr float kLampRadius = 0.14f;       // of the ball that stands for a lamp, for soft shadows
+constexpr float kSoftening = 0.12f;        // square metres added to squared distances: no hot spots beside lamps
+constexpr std::size_t kBlock = 256;        // samples a job
 
 /// Additive recurrence of the plastic number: the most even simple sequence of points in the unit square
 /// (M. Roberts, "The unreasonable effectiveness of quasirandom sequences", 2018).
@@ -30,14 +30,11 @@ Vec2 shifted(const Vec2& point, std::uint32_t phase) {
   return {p.x() - std::floor(p.x()), p.y() - std::floor(p.y())};
 }
 
-constexpr std::size_t kBounces = std::size_t{kBouncePackets} * RayTracer::kWidth;
-constexpr std::size_t kPhases = 16;
-
 /// The sampling patterns of one phase. They are the same for all samples, so sines and cosines are computed once.
 struct SamplePoints {
-  std::array<Vec2, RayTracer::kWidth> square;  // even points in the unit square
-  std::array<Vec3, RayTracer::kWidth> ball;    // on the unit ball
-  std::array<Vec3, kBounces> hemisphere;       // unit directions around Z, as many as the cosine says
+  std::array<Vec2, RayTracer::kWidth> square;      // even points in the unit square
+  std::array<Vec3, RayTracer::kWidth> ball;        // on the unit ball
+  std::array<Vec3x16, kBouncePackets> hemisphere;  // unit directions around Z, as many as the cosine says
 
   explicit SamplePoints(std::uint32_t phase) {
     for (std::uint32_t i = 0; i < RayTracer::kWidth; ++i) {
@@ -45,10 +42,14 @@ struct SamplePoints {
       const float z = 2.f * p.x() - 1.f, r = std::sqrt(1.f - z * z);
       ball[i] = Vec3(r * std::cos(kTurn * p.y()), z, r * std::sin(kTurn * p.y()));
     }
-    for (std::uint32_t i = 0; i < kBounces; ++i) {
+    for (std::uint32_t i = 0; i < kBouncePackets * RayTracer::kWidth; ++i) {
       const Vec2 p = shifted(even_point(i), phase);
       const float r = std::sqrt(p.x());
-      hemisphere[i] = Vec3(r * std::cos(kTurn * p.y()), r * std::sin(kTurn * p.y()), std::sqrt(1.f - p.x()));
+      Vec3x16& packet = hemisphere[i / RayTracer::kWidth];
+      const std::size_t lane = i % RayTracer::kWidth;
+      packet.x[lane] = r * std::cos(kTurn * p.y());
+      packet.y[lane] = r * std::sin(kTurn * p.y());
+      packet.z[lane] = std::sqrt(1.f - p.x());
     }
   }
 };
@@ -100,6 +101,8 @@ LightSolver::LightSolver(const Draft& draft, const Atlas& atlas, const std::vect
   }
   add_texels(draft);
   for (const Object& object : draft.objects) add_object(draft, object, albedo);
+  lights_ = draft.lights;
+  place_targets();
   find_reach(draft);
   tracer_ = std::make_unique<RayTracer>(std::move(vertices_), std::move(triangles_));
 }
@@ -193,9 +196,27 @@ void balance_lights(Draft& draft) {
   }
 }
 
+/// Chooses the points of each light that samples of each phase look at.
+void LightSolver::place_targets() {
+  targets_.resize(lights_.size());
+  for (std::size_t number = 0; number < lights_.size(); ++number) {
+    const Light& light = lights_[number];
+    for (std::uint32_t phase = 0; phase < kPhases; ++phase) {
+      const SamplePoints& points = points_of(phase);
+      Vec3x16& targets = targets_[number][phase];
+      for (std::size_t i = 0; i < RayTracer::kWidth; ++i) {
+        const Vec2& p = points.square[i];
+        const Vec3 target = light.one_sided()
+                                ? Vec3(light.center + (2.f * p.x() - 1.f) * light.u + (2.f * p.y() - 1.f) * light.v)
+                                : Vec3(light.center + kLampRadius * points.ball[i]);
+        targets.x[i] = target.x(), targets.y[i] = target.y(), targets.z[i] = target.z();
+      }
+    }
+  }
+}
+
 /// Finds which rooms each light reaches.
 void LightSolver::find_reach(const Draft& draft) {
-  lights_ = draft.lights;
   const auto rooms = static_cast<std::int32_t>(draft.plan.rooms.size());
   lit_.resize(static_cast<std::size_t>(rooms));
   for (std::int32_t room = 0; room < rooms; ++room) {
@@ -214,26 +235,28 @@ void LightSolver::find_reach(const Draft& draft) {
 
 Rgb LightSolver::from_light(const Sample& sample, const VisibleLight& lit) const {
   const Light& light = lights_[lit.light];
-  RayTracer::Directions to;
-  std::array<bool, RayTracer::kWidth> active{};
-  std::array<float, RayTracer::kWidth> weight{};
+  const Vec3x16& targets = targets_[lit.light][sample.phase];
+  const Vec3 &from = sample.position, &normal = sample.normal, &axis = light.axis;
+  const bool one_sided = light.one_sided();
+  Vec3x16 to;
+  Vec3x16::Row weight, here, there;
+  for (std::size_t i = 0; i < RayTracer::kWidth; ++i) {  // without branches, so that compilers vectorise it
+    to.x[i] = targets.x[i] - from.x(), to.y[i] = targets.y[i] - from.y(), to.z[i] = targets.z[i] - from.z();
+    const float square = to.x[i] * to.x[i] + (to.y[i] * to.y[i] + to.z[i] * to.z[i]), distance = std::sqrt(square);
+    here[i] = (to.x[i] * normal.x() + (to.y[i] * normal.y() + to.z[i] * normal.z())) / distance;
+    const float ahead = -(to.x[i] * axis.x() + (to.y[i] * axis.y() + to.z[i] * axis.z())) / distance;
+    const float around = 0.6f + 0.4f * to.y[i] / distance;
+    there[i] = one_sided ? ahead : around;
+    weight[i] = here[i] * there[i] / (square + kSoftening);
+  }
+  std::array<bool, RayTracer::kWidth> active;
   bool any = false;
-  const SamplePoints& points = points_of(sample.phase);
-  for (std::uint32_t i = 0; i < RayTracer::kWidth; ++i) {
-    const Vec2& p = points.square[i];
-    const Vec3 target = light.one_sided()
-                            ? Vec3(light.center + (2.f * p.x() - 1.f) * light.u + (2.f * p.y() - 1.f) * light.v)
-                            : Vec3(light.center + kLampRadius * points.ball[i]);
-    to[i] = target - sample.position;
-    const float square = to[i].squaredNorm(), distance = std::sqrt(square);
-    const float here = to[i].dot(sample.normal) / distance;
-    const float there = light.one_sided() ? -to[i].dot(light.axis) / distance : 0.6f + 0.4f * to[i].y() / distance;
-    active[i] = here > 0.f && there > 0.f && (lit.through == nullptr || passes(*lit.through, sample.position, target));
-    weight[i] = here * there / (square + kSoftening);
+  for (std::size_t i = 0; i < RayTracer::kWidth; ++i) {
+    active[i] = here[i] > 0.f && there[i] > 0.f && (lit.through == nullptr || passes(*lit.through, from, targets[i]));
     any = any || active[i];
   }
   if (!any) return Rgb::Zero();
-  const auto blocked = tracer_->blocked(sample.position, to, active);
+  const auto blocked = tracer_->blocked(from, to, active);
   float sum = 0.f;
   for (std::size_t i = 0; i < RayTracer::kWidth; ++i) sum += blocked[i] ? 0.f : weight[i];
   return light.strength * (sum / RayTracer::kWidth);
@@ -252,10 +275,12 @@ Rgb LightSolver::bounced(const Sample& sample, const std::vector<Rgb>& direct_li
   const SamplePoints& points = points_of(sample.phase);
   Rgb sum = Rgb::Zero();
   for (std::size_t packet = 0; packet < kBouncePackets; ++packet) {
-    RayTracer::Directions directions;
+    const Vec3x16& local = points.hemisphere[packet];
+    Vec3x16 directions;
     for (std::size_t i = 0; i < RayTracer::kWidth; ++i) {
-      const Vec3& local = points.hemisphere[packet * RayTracer::kWidth + i];
-      directions[i] = local.x() * frame.x + local.y() * frame.y + local.z() * frame.z;
+      directions.x[i] = local.x[i] * frame.x.x() + local.y[i] * frame.y.x() + local.z[i] * frame.z.x();
+      directions.y[i] = local.x[i] * frame.x.y() + local.y[i] * frame.y.y() + local.z[i] * frame.z.y();
+      directions.z[i] = local.x[i] * frame.x.z() + local.y[i] * frame.y.z() + local.z[i] * frame.z.z();
     }
     const auto hits = tracer_->trace(sample.position, directions);
     for (std::size_t i = 0; i < RayTracer::kWidth; ++i) {

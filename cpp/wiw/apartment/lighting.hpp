@@ -40,6 +40,7 @@ class LightSolver {
   void add_texels(const Draft& draft);
   void add_object(const Draft& draft, const Object& object, const std::vector<Rgb>& albedo);
   void add_vertices(const Submesh& part, const Object& object);
+  void place_targets();
   void find_reach(const Draft& draft);
   [[nodiscard]] Rgb direct(const Sample& sample) const;
   [[nodiscard]] Rgb from_light(const Sample& sample, const VisibleLight& lit) const;
@@ -50,7 +51,8 @@ class LightSolver {
   const Atlas& atlas_;
   const std::vector<Chart>& charts_;
   std::vector<Light> lights_;
-  std::vector<std::vector<VisibleLight>> lit_;  // by room
+  std::vector<std::array<Vec3x16, kPhases>> targets_;  // points on each light
+  std::vector<std::vector<VisibleLight>> lit_;         // by room
   std::vector<Sample> samples_;
   std::vector<Face> faces_;
   std::vector<std::int32_t> face_room_;

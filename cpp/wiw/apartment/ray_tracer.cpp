@@ -13,6 +13,7 @@ RayTracer::RayTracer(std::vector<Vec3> vertices, std::vector<scene::Triangle> tr
   device_ = rtcNewDevice("threads=1,set_affinity=0");
   if (device_ == nullptr)
     throw BackendError("Embree could not create a device (error " + std::to_string(rtcGetDeviceError(nullptr)) + ")");
+  wide_ = rtcGetDeviceProperty(device_, RTC_DEVICE_PROPERTY_NATIVE_RAY16_SUPPORTED) != 0;
   vertices_.emplace_back(Vec3::Zero());  // Embree reads vertices 16 bytes at a time
   scene_ = rtcNewScene(device_);
   RTCGeometry geometry = rtcNewGeometry(device_, RTC_GEOMETRY_TYPE_TRIANGLE);
@@ -33,50 +34,84 @@ RayTracer::~RayTracer() {
 
 namespace {
 
-template <class Rays>
-void set_rays(Rays& rays, const Vec3& origin, const RayTracer::Directions& directions, float far) {
-  for (int i = 0; i < RayTracer::kWidth; ++i) {
-    const Vec3& d = directions[static_cast<std::size_t>(i)];
+struct Packet8 {
+  static constexpr std::size_t kSize = 8;
+  using Rays = RTCRay8;
+  using RayHits = RTCRayHit8;
+  static constexpr auto kOccluded = rtcOccluded8;
+  static constexpr auto kIntersect = rtcIntersect8;
+};
+
+struct Packet16 {
+  static constexpr std::size_t kSize = 16;
+  using Rays = RTCRay16;
+  using RayHits = RTCRayHit16;
+  static constexpr auto kOccluded = rtcOccluded16;
+  static constexpr auto kIntersect = rtcIntersect16;
+};
+
+/// Sets as many rays as a packet has, from the first-th direction on.
+template <class Packet>
+void set_rays(typename Packet::Rays& rays, const Vec3& origin, const Vec3x16& to, std::size_t first, float far) {
+  for (std::size_t i = 0; i < Packet::kSize; ++i) {
     rays.org_x[i] = origin.x(), rays.org_y[i] = origin.y(), rays.org_z[i] = origin.z();
-    rays.dir_x[i] = d.x(), rays.dir_y[i] = d.y(), rays.dir_z[i] = d.z();
+    rays.dir_x[i] = to.x[first + i], rays.dir_y[i] = to.y[first + i], rays.dir_z[i] = to.z[first + i];
     rays.tnear[i] = 0.f, rays.tfar[i] = far;
     rays.mask[i] = 0xFFFFFFFFu, rays.flags[i] = 0, rays.time[i] = 0.f, rays.id[i] = 0;
   }
 }
 
-}  // namespace
+using Blocked = std::array<bool, RayTracer::kWidth>;
 
-std::array<bool, RayTracer::kWidth> RayTracer::blocked(const Vec3& origin, const Directions& directions,
-                                                       const std::array<bool, kWidth>& active) const {
-  alignas(64) RTCRay16 rays;
-  alignas(64) std::array<int, kWidth> valid{};
-  set_rays(rays, origin, directions, 0.999f);
-  for (std::size_t i = 0; i < kWidth; ++i) valid[i] = active[i] ? -1 : 0;
+template <class Packet>
+Blocked find_blocked(RTCScene scene, const Vec3& origin, const Vec3x16& directions, const Blocked& active) {
   RTCIntersectContext context;
   rtcInitIntersectContext(&context);
   context.flags = RTC_INTERSECT_CONTEXT_FLAG_COHERENT;
-  rtcOccluded16(valid.data(), scene_, &context, &rays);
-  std::array<bool, kWidth> result{};
-  for (std::size_t i = 0; i < kWidth; ++i) result[i] = !active[i] || rays.tfar[i] < 0.f;
+  alignas(64) typename Packet::Rays rays;
+  alignas(64) std::array<int, Packet::kSize> valid;
+  Blocked result;
+  for (std::size_t first = 0; first < RayTracer::kWidth; first += Packet::kSize) {
+    set_rays<Packet>(rays, origin, directions, first, 0.999f);
+    for (std::size_t i = 0; i < Packet::kSize; ++i) valid[i] = active[first + i] ? -1 : 0;
+    Packet::kOccluded(valid.data(), scene, &context, &rays);
+    for (std::size_t i = 0; i < Packet::kSize; ++i) result[first + i] = !active[first + i] || rays.tfar[i] < 0.f;
+  }
   return result;
 }
 
-std::array<Hit, RayTracer::kWidth> RayTracer::trace(const Vec3& origin, const Directions& directions) const {
-  alignas(64) RTCRayHit16 rays;
-  alignas(64) std::array<int, kWidth> valid;
-  valid.fill(-1);
-  set_rays(rays.ray, origin, directions, std::numeric_limits<float>::infinity());
-  for (int i = 0; i < kWidth; ++i)
-    rays.hit.geomID[i] = RTC_INVALID_GEOMETRY_ID, rays.hit.instID[0][i] = RTC_INVALID_GEOMETRY_ID;
+template <class Packet>
+std::array<Hit, RayTracer::kWidth> find_hits(RTCScene scene, const Vec3& origin, const Vec3x16& directions) {
   RTCIntersectContext context;
   rtcInitIntersectContext(&context);
-  rtcIntersect16(valid.data(), scene_, &context, &rays);
-  std::array<Hit, kWidth> hits;
-  for (std::size_t i = 0; i < kWidth; ++i) {
-    if (rays.hit.geomID[i] == RTC_INVALID_GEOMETRY_ID) continue;
-    hits[i] = {static_cast<std::int32_t>(rays.hit.primID[i]), rays.hit.u[i], rays.hit.v[i], rays.ray.tfar[i]};
+  alignas(64) typename Packet::RayHits rays;
+  alignas(64) std::array<int, Packet::kSize> valid;
+  valid.fill(-1);
+  std::array<Hit, RayTracer::kWidth> hits;
+  for (std::size_t first = 0; first < RayTracer::kWidth; first += Packet::kSize) {
+    set_rays<Packet>(rays.ray, origin, directions, first, std::numeric_limits<float>::infinity());
+    for (std::size_t i = 0; i < Packet::kSize; ++i)
+      rays.hit.geomID[i] = RTC_INVALID_GEOMETRY_ID, rays.hit.instID[0][i] = RTC_INVALID_GEOMETRY_ID;
+    Packet::kIntersect(valid.data(), scene, &context, &rays);
+    for (std::size_t i = 0; i < Packet::kSize; ++i) {
+      if (rays.hit.geomID[i] == RTC_INVALID_GEOMETRY_ID) continue;
+      hits[first + i] = {static_cast<std::int32_t>(rays.hit.primID[i]), rays.hit.u[i], rays.hit.v[i], rays.ray.tfar[i]};
+    }
   }
   return hits;
+}
+
+}  // namespace
+
+// Embree splits packets that are wider than the CPU's registers into single rays, which takes longer.
+std::array<bool, RayTracer::kWidth> RayTracer::blocked(const Vec3& origin, const Vec3x16& directions,
+                                                       const std::array<bool, kWidth>& active) const {
+  const auto find = wide_ ? find_blocked<Packet16> : find_blocked<Packet8>;
+  return find(scene_, origin, directions, active);
+}
+
+std::array<Hit, RayTracer::kWidth> RayTracer::trace(const Vec3& origin, const Vec3x16& directions) const {
+  return (wide_ ? find_hits<Packet16> : find_hits<Packet8>)(scene_, origin, directions);
 }
 
 }  // namespace wiw::apartment

@@ -4,6 +4,7 @@
 #include <embree3/rtcore.h>
 
 #include <array>
+#include <cstddef>
 #include <vector>
 
 #include "wiw/apartment/shape.hpp"
@@ -16,11 +17,19 @@ struct Hit {
   float u = 0.f, v = 0.f, distance = 0.f;
 };
 
+/// One vector for each of the sixteen rays that are traced together, by coordinate.
+struct Vec3x16 {
+  static constexpr std::size_t kCount = 16;
+  using Row = std::array<float, kCount>;
+  alignas(64) Row x, y, z;
+
+  [[nodiscard]] Vec3 operator[](std::size_t i) const { return {x[i], y[i], z[i]}; }
+};
+
 /// Sixteen rays from one point against a fixed triangle soup.
 class RayTracer {
  public:
-  static constexpr int kWidth = 16;
-  using Directions = std::array<Vec3, kWidth>;
+  static constexpr std::size_t kWidth = Vec3x16::kCount;
 
   RayTracer(std::vector<Vec3> vertices, std::vector<scene::Triangle> triangles);
   ~RayTracer();
@@ -28,15 +37,16 @@ class RayTracer {
   RayTracer& operator=(const RayTracer&) = delete;
 
   /// Which of the active segments origin + (0, 1] * direction are blocked.
-  [[nodiscard]] std::array<bool, kWidth> blocked(const Vec3& origin, const Directions& directions,
+  [[nodiscard]] std::array<bool, kWidth> blocked(const Vec3& origin, const Vec3x16& directions,
                                                  const std::array<bool, kWidth>& active) const;
-  [[nodiscard]] std::array<Hit, kWidth> trace(const Vec3& origin, const Directions& directions) const;
+  [[nodiscard]] std::array<Hit, kWidth> trace(const Vec3& origin, const Vec3x16& directions) const;
 
  private:
   std::vector<Vec3> vertices_;
   std::vector<scene::Triangle> triangles_;
   RTCDevice device_ = nullptr;
   RTCScene scene_ = nullptr;
+  bool wide_ = false;  // whether this CPU traces sixteen rays at once, and not eight
 };
 
 }  // namespace wiw::apartment
