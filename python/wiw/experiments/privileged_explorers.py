@@ -17,6 +17,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from wiw._core import core
+from wiw.datasets.ar import category_of
+from wiw.datasets.questions.mesh_table import NAMES
 from wiw.loop.privileged import LiveEnvironments, Privileged
 from wiw.mapping.views import HFOV_DEG, Views, cut_labels, cut_views
 from wiw.perception.colors import COLORS
@@ -72,10 +74,23 @@ class PrivilegedExplorer(Explorer, Privileged):
         """Return the views and their labels; with instance ids, from these, with each thing painted in its colour."""
         if look.ids is None:
             return super().perceive(situation, look, pose)
-        instances = self._environments.find(situation.key).state.world.scene.instances
+        instances = _rename(self._environments.find(situation.key).state.world.scene.instances)
         views, ids = cut_views(look.panorama, look.depth, pose, VIEW_SIZE), cut_labels(look.ids, VIEW_SIZE)
         labels = OracleLabeller(instances, self.labeller.categories).label(views.images, HFOV_DEG, ids)
-        return replace(views, images=_paint_colors(instances)[ids]), labels
+        return replace(views, images=self._paint(views.images, ids, instances)), labels
+
+    def _paint(
+        self, images: NDArray[np.uint8], ids: NDArray[np.uint32], instances: Sequence[Mapping[str, Any]]
+    ) -> NDArray[np.uint8]:
+        """Return views in which the red of each pixel is the number of its thing's colour.
+
+        Where a scene does not say it, that is the colour which the explorer itself sees.
+        """
+        painted = _paint_colors(instances)[ids]
+        for each in instances:
+            if each["attributes"].get("color") not in COLORS and (own := ids == each["id"]).any():
+                painted[own] = COLORS.index(super().name_color(images[own], each["category"])[0])
+        return painted
 
     def name_color(self, pixels: NDArray[np.uint8], category: str) -> tuple[str, float]:
         """Return the colour word that painted pixels stand for, or that real ones show."""
@@ -86,6 +101,12 @@ class PrivilegedExplorer(Explorer, Privileged):
     def is_final(self, situation: Situation) -> bool:
         """Return whether the present belief is given as the answer: after a tour there is nothing left to see."""
         return self.tour or super().is_final(situation)
+
+
+def _rename(instances: Iterable[Mapping[str, Any]]) -> list[dict[str, Any]]:
+    """Return instances with categories in the words of apartments, which labellers and questions use."""
+    named = ((each, category_of(each)) for each in instances)
+    return [{**each, "category": NAMES.get(name, name)} for each, name in named]
 
 
 def _paint_colors(instances: Sequence[Mapping[str, Any]]) -> NDArray[np.uint8]:

@@ -20,8 +20,9 @@ from wiw.errors import JudgeError
 from wiw.judging.judge import HIGHEST_MARK, LOWEST_MARK, Judge, Judgement, Reference
 from wiw.judging.normalise import has_negation, normalise
 from wiw.judging.vocabulary import load_vocabulary
+from wiw.judging.words import split_raw_words
 
-TOKEN_F1_VERSION = 1
+TOKEN_F1_VERSION = 2
 """Raised when an answer may get another mark than before, beside changes of the vocabulary."""
 
 
@@ -57,5 +58,7 @@ def token_f1(right: str, answer: str) -> float:
     if has_negation(right) != has_negation(answer):
         return 0.0
     wanted, said = normalise(right).split(), normalise(answer).split()
+    if not wanted:  # an article, such as the letter A
+        wanted, said = split_raw_words(right), split_raw_words(answer)
     shared = sum((Counter(wanted) & Counter(said)).values())
     return 2 * shared / (len(wanted) + len(said)) if shared else 0.0

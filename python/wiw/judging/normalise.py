@@ -19,6 +19,7 @@ __all__ = [
     "cut_after_last_period",
     "find_concepts",
     "find_negated",
+    "find_states",
     "has_negation",
     "normalise",
     "read_counts",
@@ -31,6 +32,8 @@ NEGATIONS = frozenset(
 _REPLACED = frozenset({"instead", "rather"})
 """Words before "of" or "than" and what is not the case."""
 _YES = frozenset({"yes", "yeah", "yep", "yup", "true", "correct", "affirmative", "indeed", "certainly", "definitely"})
+_EMPHATIC = frozenset({"indeed", "certainly", "definitely"})
+"""Words of `_YES` that "not" turns round right behind them; "yes, not far from the sofa" remains a yes."""
 _NO = frozenset({"no", "nope", "nah", "false", "incorrect", "negative"})
 _UNSURE = frozenset({"maybe", "perhaps", "possibly", "unsure", "unknown", "uncertain", "unclear"})
 _FORMS_OF_BE = frozenset({"is", "are", "was", "were", "be", "am"})
@@ -40,8 +43,15 @@ _PREPOSITIONS = frozenset({
     "inside", "against", "over", "opposite", "from", "to", "across", "along", "around",
 })  # fmt: skip
 _COPULAS = _FORMS_OF_BE | {"look", "appear", "seem", "called"}
+_NOTICED = frozenset({"see", "seen", "find", "found", "have", "has", "had", "can", "could", "did", "any"})
+"""Words of an answer to "is there ...?" that say no more than "there is"."""
+_VERBS = _FORMS_OF_BE | _NOTICED - {"any"} | {"do", "does", "think"}
+"""Words of which a statement has one; "it" alone affirms nothing."""
 _OPPOSITES = (("open", "closed"), ("on", "off"), ("made", "unmade"))
+OPPOSITE_STATES = {one: other for pair in _OPPOSITES for one, other in (pair, pair[::-1])}
 _PAIRS = frozenset({"couple", "pair", "both"})
+_LEADS = (["there", "is"], ["i", "see"], ["i", "found"])
+"""Words before the article of a single thing: "there is a chair"."""
 
 
 def normalise(text: str) -> str:
@@ -91,6 +101,15 @@ def find_negated(text: str, kinds: Sequence[Kind]) -> list[Concept]:
     return list(dict.fromkeys(found))
 
 
+def find_states(text: str) -> list[Concept]:
+    """Return the states that a text affirms, in order, else the opposites of those it denies: "not open" is closed."""
+    affirmed = find_concepts(text, ["state"])
+    if affirmed:
+        return affirmed
+    denied = [OPPOSITE_STATES.get(concept.name) for concept in find_negated(text, ["state"])]
+    return [Concept("state", name) for name in denied if name is not None]
+
+
 def is_negated(words: Sequence[str], match: Match) -> bool:
     """Return whether a word before a match negates it."""
     return any(word in NEGATIONS or word in _REPLACED for word in words[: match.start])
@@ -118,7 +137,8 @@ def read_counts(text: str) -> list[int]:
         return [2]
     if any(word in NEGATIONS for word in words):
         return [0]
-    return [1] if (len(raw) > 1 and raw[0] in ARTICLES - {"the"}) or {"single", "once"} & set(words) else []
+    named = raw[2:] if raw[:2] in _LEADS else raw
+    return [1] if (len(named) > 1 and named[0] in ARTICLES - {"the"}) or {"single", "once"} & set(words) else []
 
 
 def read_polarity(text: str, question: str = "") -> bool | None:
@@ -133,7 +153,7 @@ def read_polarity(text: str, question: str = "") -> bool | None:
     if not words or _UNSURE & set(words) or _says_yes_and_no(words):
         return None
     if words[0] in _YES | _NO:
-        negated = words[1:2] == ["not"] and words[0] in _YES  # "certainly not"
+        negated = words[1:2] == ["not"] and words[0] in _EMPHATIC  # "certainly not"
         return words[0] in _YES and not negated
     negated = has_negation(text) != any(word in ("false", "incorrect") for word in words)
     if explicit or (negated and not question):
@@ -156,14 +176,27 @@ def _compare_statement(text: str, question: str, negated: bool) -> bool | None:
     """Return whether a statement agrees with a question; None if they are about different things."""
     vocabulary = load_vocabulary()
     asked, said = split_words(question), split_words(text)
-    for one, other in _OPPOSITES:
-        states = [[m.concept.name for m in vocabulary.find(words, ["state"])][-1:] for words in (asked, said)]
-        if all(state and state[0] in (one, other) for state in states):
-            return (states[0] == states[1]) != negated
+    wanted = [match.concept.name for match in vocabulary.find(asked, ["state"])][-1:]
+    stated = [concept.name for concept in find_states(text)][-1:]  # its negation is a state too: "not lit" is off
+    if wanted and stated and stated[0] in (wanted[0], OPPOSITE_STATES.get(wanted[0])):
+        return wanted == stated
     colors = [{m.concept for m in vocabulary.find(words, ["color"])} for words in (asked, said)]
     if all(colors) and not negated:
         return colors[0] == colors[1]
+    return _compare_content(normalise(text).split(), normalise(question).split(), negated)
+
+
+def _compare_content(said: Sequence[str], asked: Sequence[str], negated: bool) -> bool | None:
+    """Return whether a statement in a question's own words, or in pronouns, affirms it; None if it has other words.
+
+    Where a question begins with "is there", "I see two" says so of what it asks for.
+    """
     content = set(said) - NEGATIONS - _FORMS_OF_BE - _PLACEHOLDERS
-    if content <= set(asked) and _FORMS_OF_BE | {"do", "does", "can", "has"} & set(said) and (set(said) - content):
-        return not negated
-    return None
+    if asked[1:2] == ["there"] and asked[0] in _FORMS_OF_BE:
+        stop = next((place for place, word in enumerate(asked) if word in _PREPOSITIONS), len(asked))
+        content -= _NOTICED | {word for word in content if word.isdecimal() and word != "0"}
+        if content and not content & set(asked[2:stop]):
+            return None
+    if not content <= set(asked) or not (negated or _VERBS & set(said)):
+        return None
+    return not negated

@@ -21,24 +21,16 @@ from typing import Any
 
 from wiw.errors import JudgeError
 from wiw.judging.judge import HIGHEST_MARK, LOWEST_MARK, Judge, Judgement, Reference
-from wiw.judging.normalise import find_concepts, find_negated, normalise, read_counts, read_polarity
+from wiw.judging.normalise import find_concepts, find_states, normalise, read_counts, read_polarity
 from wiw.judging.places import mark_place, names_place
 from wiw.judging.vocabulary import Concept, Kind, Relation, load_vocabulary
 
-RULES_VERSION = 1
+RULES_VERSION = 2
 """Raised when an answer may get another mark than before, beside changes of the vocabulary."""
 OFF_BY_ONE_MARK = 2
 COLOR_MARKS = {Relation.SAME: 5, Relation.BROADER: 4, Relation.NEAR: 3}
 OBJECT_MARKS = {Relation.SAME: 5, Relation.BROADER: 4, Relation.GROUP: 2}
 STATE_MARKS = {Relation.SAME: 5, Relation.NEAR: 2}
-OPPOSITE_STATES = {
-    "open": "closed",
-    "closed": "open",
-    "on": "off",
-    "off": "on",
-    "made": "unmade",
-    "unmade": "made",
-}
 Rule = Callable[[str, str, str], "int | None"]
 """(question, right answer, answer) to the mark; None if the right answer is beyond the rule."""
 
@@ -116,7 +108,7 @@ def mark_category(question: str, right: str, answer: str) -> int | None:
 
 def mark_state(question: str, right: str, answer: str) -> int | None:
     """Return the mark of a state; "not open" is closed."""
-    return _mark_concepts(_find_states(right), _find_states(answer), STATE_MARKS)
+    return _mark_concepts(find_states(right), find_states(answer), STATE_MARKS)
 
 
 RULES: dict[str, Rule] = {
@@ -139,14 +131,6 @@ def _mark_named(kind: Kind, right: str, answer: str) -> int:
         words, wanted = f" {normalise(answer)} ", f" {normalise(right)} "
         return HIGHEST_MARK if wanted in words and " not " not in words else LOWEST_MARK
     return _mark_concepts(known, find_concepts(answer, [kind]), OBJECT_MARKS) or LOWEST_MARK
-
-
-def _find_states(text: str) -> list[Concept]:
-    affirmed = find_concepts(text, ["state"])
-    if affirmed:
-        return affirmed
-    denied = [OPPOSITE_STATES.get(concept.name) for concept in find_negated(text, ["state"])]
-    return [Concept("state", name) for name in denied if name is not None]
 
 
 def _mark_concepts(right: list[Concept], said: list[Concept], marks: Mapping[Relation, int]) -> int | None:

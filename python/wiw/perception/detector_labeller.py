@@ -70,9 +70,9 @@ class DetectorLabeller(Labeller):
         return SceneLabels(category, confidence, np.zeros_like(category))
 
     def describe(self) -> dict[str, Any]:
-        """Return the names of detector and segmenter."""
+        """Return the names of detector and segmenter, and of the objects to find."""
         parts = {"detector": type(self.detector).__name__, "segmenter": type(self.segmenter).__name__}
-        return {**super().describe(), **parts, "least_score": self.least_score}
+        return {**super().describe(), **parts, "names": list(self.categories[1:]), "least_score": self.least_score}
 
     def _paint(
         self,

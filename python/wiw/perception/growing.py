@@ -81,6 +81,8 @@ def _run_grabcut(image: NDArray[np.uint8], seed: Mask, unseen: Mask) -> Mask:
         return seed
     near = cv2.dilate(settled.astype(np.uint8), np.ones((SEED_MARGIN, SEED_MARGIN), np.uint8)) > 0
     labels[near & (labels == cv2.GC_PR_BGD)] = cv2.GC_PR_FGD
+    if (labels & 1).all():  # no background to compare with
+        return seed
     small = np.ascontiguousarray(cv2.resize(image, size, interpolation=cv2.INTER_AREA))
     cv2.setRNGSeed(0)  # its mixtures of colours begin at random
     rectangle = (0, 0, 0, 0)  # not looked at where a mask is given

@@ -3,7 +3,6 @@
 
 from __future__ import annotations
 
-import pickle
 from pathlib import Path
 from typing import Any
 
@@ -149,15 +148,19 @@ def _read_state(path: Path) -> dict[str, Any]:
     import torch
 
     if path.suffix == ".safetensors":
+        from safetensors import SafetensorError
         from safetensors.torch import load_file
 
-        return load_file(path)
+        try:
+            return load_file(path)
+        except (OSError, SafetensorError) as error:
+            raise WeightsError(f"{path}: expected RedNet's weights (safetensors): {error}", "unfit") from error
     numbers = [(np.float64(0).__reduce__()[0], f"numpy.{core}.multiarray.scalar") for core in ("core", "_core")]
     allowed: list[Any] = [*numbers, np.dtype, type(np.dtype(np.float64))]  # best scores lie beside the weights
     try:
         with torch.serialization.safe_globals(allowed):
             checkpoint: Any = torch.load(path, map_location="cpu", weights_only=True)
-    except (pickle.UnpicklingError, RuntimeError, EOFError) as error:
+    except Exception as error:  # of bytes that are no checkpoint, unpickling makes errors of any kind
         first = (str(error).strip().splitlines() or [type(error).__name__])[0]
         raise WeightsError(
             f"{path}: not a checkpoint that can be read without running code from it ({first}); save its 'model_state' "

@@ -257,7 +257,8 @@ class AEQA(NavigationTask):
         `mark` 1 to 5; `answer_score` (mark - 1) / 4; `success` 0 or 1, 1 for the highest mark; `spl`, the episode's
         contribution; `path_length` in metres and `shortest`, L*; `primitives`; `answered` 0 or 1; `score_at_30` and so
         on, the score if the episode had been cut there; `grounded` 0 or 1, whether what the question is about was in
-        sight before the answer, where that is known.
+        sight before the answer. Without `shortest` and `spl` where L* is not known, and without `grounded` where that
+        is not.
 
         Raises:
             JudgeError: the judge gave no mark.
@@ -304,7 +305,7 @@ class AEQA(NavigationTask):
         question, answer = read_question(state.episode), self.final_answer(state)
         measured = {
             "path_length": state.path_length,
-            "shortest": state.episode.geodesic if np.isfinite(state.episode.geodesic) else 0.0,
+            **({"shortest": state.episode.geodesic} if np.isfinite(state.episode.geodesic) else {}),
             "primitives": float(state.actions),
             "answered": float(bool(answer)),
             **self._measure_grounding(state),

@@ -33,7 +33,7 @@ class AnswerRecord:
     """The best guess from the question's text alone."""
     unanswered: Unanswered
     measured: Mapping[str, float]
-    """Metrics that no mark changes, "path_length", "shortest" (L*) and "primitives" among them."""
+    """Metrics that no mark changes, "path_length", "primitives" and, where it is known, "shortest" (L*) among them."""
 
     @property
     def reference(self) -> Reference:
@@ -52,7 +52,8 @@ class AnswerRecord:
             KeyError: a metric is missing.
             TypeError: one is not a number, or an answer is not text.
         """
-        for name in ("path_length", "shortest", "primitives"):
+        known = ("shortest",) if "shortest" in self.measured else ()
+        for name in ("path_length", "primitives", *known):
             if not isinstance(self.measured[name], int | float):
                 raise TypeError(f"number {name}")
         if not isinstance(self.answer, str) or not isinstance(self.blind, str):
@@ -65,18 +66,25 @@ class AnswerRecord:
             judgements: of all `answers`, by answer.
         """
         end, blind = self.select_judgement(judgements), judgements[self.blind]
-        score, blind_score = map_mark(end.mark), map_mark(blind.mark)
-        counts = bool(self.answer) or self.unanswered == "blind_with_path"
-        credit, walk = score if counts else 0.0, self.measured
+        score, walk = map_mark(end.mark), self.measured
+        without = 0.0 if self.unanswered == "lowest" else map_mark(blind.mark)
         in_time = {cut: bool(self.answer) and walk["primitives"] <= cut for cut in CUTS}
         return {
             "success": float(bool(self.answer) and end.mark == HIGHEST_MARK),
             "mark": float(end.mark),
             "answer_score": score,
-            "spl": float(path_efficiency([credit], [walk["shortest"]], [walk["path_length"]])[0]),
+            **self._weigh_by_path(score),
             **walk,
-            **{f"score_at_{cut}": score if in_time[cut] else blind_score for cut in CUTS},
+            **{f"score_at_{cut}": score if in_time[cut] else without for cut in CUTS},
         }
+
+    def _weigh_by_path(self, score: float) -> dict[str, float]:
+        """Return the episode's contribution to SPL; nothing where L* is not known."""
+        if "shortest" not in self.measured:
+            return {}
+        counts = bool(self.answer) or self.unanswered == "blind_with_path"
+        walk = [self.measured["shortest"]], [self.measured["path_length"]]
+        return {"spl": float(path_efficiency([score if counts else 0.0], *walk)[0])}
 
     def select_judgement(self, judgements: Mapping[str, Judgement]) -> Judgement:
         """Return the judgement of the final answer, or what the rules put in its place."""

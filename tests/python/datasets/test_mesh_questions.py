@@ -5,6 +5,7 @@ from __future__ import annotations
 
 import json
 import shutil
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -177,6 +178,15 @@ def test_a_house_of_meshes_has_rooms_colors_and_questions(house):
     assert asked["What color is the bed?"] == "red" and asked["In which room is the sofa?"] == "living room"
     assert asked["Where is the vase?"] == "on the coffee table in the living room"
     assert not any("made of" in text or "open" in text or " left " in text for text in asked)
+
+
+def test_nothing_is_asked_about_names_that_questions_cannot_speak_of(house):
+    found = look_around(world(house, "cpu"), 0, RULES)
+    names = {"wardrobe": "cabinet left", "coffee table": "table/unknown", "refrigerator": "fridge on wall"}
+    things = tuple(replace(each, category=names.get(each.category, each.category)) for each in found.table.things)
+    texts = [each.text for each in find_questions(replace(found, table=replace(found.table, things=things)))]
+    assert "What color is the bed?" in texts
+    assert not any(name in text for name in names.values() for text in texts)
 
 
 def test_questions_do_not_depend_on_the_folder(house, tmp_path):

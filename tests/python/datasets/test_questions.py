@@ -18,7 +18,7 @@ from wiw import scenes
 from wiw.datasets import episodes as episode_file
 from wiw.datasets.cameras import camera_pose
 from wiw.datasets.questions import Question, balance, blind, generate, grammar, parse, phrase, twins
-from wiw.datasets.questions.answers import LOOKED_FOR, Fact, are_different, find_answer, propose
+from wiw.datasets.questions.answers import LOOKED_FOR, Fact, Sight, are_different, find_answer, propose
 from wiw.datasets.questions.colors import name_colors
 from wiw.datasets.questions.facts import BROADER, SMALL, Room, SceneTable, Thing
 from wiw.datasets.questions.generate import EpisodeRules
@@ -129,6 +129,9 @@ def test_a_question_travels_as_json() -> None:
     ("change", "message"),
     [
         ({"answer": " "}, "answer with words"),
+        ({"answer": "?"}, "answer with words"),
+        ({"extra_answers": ["since", "..."]}, "answer with words"),
+        ({"extra_answers": "since"}, "extra_answers: expected a list of texts, got 'since'"),
         ({"category": "colour"}, "category"),
         ({"answer_type": "number"}, "answer_type"),
         ({"viewpoints": [[0, 0, 0]]}, "viewpoints"),
@@ -254,6 +257,15 @@ def test_views_of_the_survey_are_what_a_camera_shows(two_rooms: str) -> None:
         ids = place.renderer.perspective(pose[None], (240, 280), HFOV, outputs=("instance",))["instance"]
         shares = np.bincount(ids.ravel(), minlength=surveyed.shares.shape[2]) / ids.size
         np.testing.assert_allclose(surveyed.shares[i, yaw], shares, atol=0.015)  # of pixels 1.4 degrees wide
+
+
+def test_viewpoints_are_near_their_thing_where_a_table_lacks_instances() -> None:
+    scan = replace(TABLE, things=tuple(each for each in TABLE.things if each is not BED))  # without a surface
+    points = np.array([[x, 0.0, 0.5] for x in (-4.0, -2.0, 2.0, 4.0)])
+    views = Survey(points, np.ones((4, 16, 8), np.float32), np.zeros((4, 4)))
+    for instance, near in ((LAMP.id, [True, True, False, False]), (WARDROBE.id, [False, False, True, True])):
+        found = views.find_viewpoints(scan, Sight((instance,)), 0.003, 0.001, 3.0)
+        assert found.all(axis=1).tolist() == near
 
 
 def test_the_shortest_route_passes_every_sight() -> None:

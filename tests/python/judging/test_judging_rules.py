@@ -20,6 +20,7 @@ from wiw.judging.words import make_singular, split_words
 
 DOOR, COUNT, COLOR = "Is the bathroom door open?", "How many chairs are there?", "What color is the sofa?"
 MADE_OF, WHAT, STATE = "What is the desk made of?", "What is on the sideboard?", "Is the curtain open or closed?"
+PIANO = "Is there a piano in the living room?"
 WHERE, ROOM = "Where is the vase?", "Which room is the piano in?"
 PAIRS = [  # type, question, right answer, answer, mark
     ("yes_no", DOOR, "yes", "yes", 5),
@@ -38,6 +39,29 @@ PAIRS = [  # type, question, right answer, answer, mark
     ("yes_no", "Are there plants in the study?", "no", "there are no plants", 5),
     ("yes_no", "Are there plants in the study?", "yes", "there are no plants", 1),
     ("yes_no", "Are there plants in the study?", "yes", "there are plants in the study", 5),
+    ("yes_no", DOOR, "yes", "it's not shut", 5),
+    ("yes_no", DOOR, "no", "it's not shut", 1),
+    ("yes_no", DOOR, "yes", "it is not closed but open", 5),
+    ("yes_no", DOOR, "no", "it's not open, it's closed", 5),
+    ("yes_no", DOOR, "no", "I can't see it", 1),
+    ("yes_no", "Is the lamp on?", "no", "it's not lit", 5),
+    ("yes_no", "Is the lamp on?", "yes", "it's not lit", 1),
+    ("yes_no", PIANO, "yes", "yes, not far from the window", 5),
+    ("yes_no", PIANO, "no", "certainly not", 5),
+    ("yes_no", PIANO, "no", "I don't see a piano", 5),
+    ("yes_no", PIANO, "yes", "I don't see a piano", 1),
+    ("yes_no", PIANO, "no", "there isn't one", 5),
+    ("yes_no", PIANO, "no", "not that I can see", 5),
+    ("yes_no", PIANO, "no", "the living room does not have a piano", 5),
+    ("yes_no", PIANO, "yes", "the living room has a piano", 5),
+    ("yes_no", PIANO, "yes", "I found two pianos", 5),
+    ("yes_no", PIANO, "yes", "I see zero pianos", 1),
+    ("yes_no", PIANO, "yes", "there is a living room", 1),
+    ("yes_no", PIANO, "no", "I can't see the living room", 1),
+    ("yes_no", PIANO, "yes", "I think so", 5),
+    ("yes_no", PIANO, "yes", "I don't know", 1),
+    ("yes_no", PIANO, "yes", "I", 1),  # cut off
+    ("yes_no", "Is there a sofa in the study?", "yes", "there is a couch", 5),
     ("count", COUNT, "4", "4", 5),
     ("count", COUNT, "four", "4", 5),
     ("count", COUNT, "4", "there are four chairs", 5),
@@ -50,6 +74,8 @@ PAIRS = [  # type, question, right answer, answer, mark
     ("count", COUNT, "0", "there are no chairs", 5),
     ("count", COUNT, "1", "there are no chairs", 2),
     ("count", COUNT, "1", "a chair", 5),
+    ("count", COUNT, "1", "there's a chair", 5),
+    ("count", COUNT, "1", "I see a chair by the table", 5),
     ("count", COUNT, "twenty-one", "21", 5),
     ("count", COUNT, "2", "a couple", 5),
     ("color", COLOR, "red", "red", 5),
@@ -221,6 +247,7 @@ def test_word_overlap() -> None:
     assert mark("a round mirror", "round mirrors") == 5
     assert mark("it is not on", "it is on") == 1
     assert mark("to wash hands", "sleeping") == 1
+    assert mark("A", "a") == 5 and mark("A", "the letter A") == 3 and mark("A", "B") == 1
 
 
 @pytest.mark.parametrize(
@@ -334,5 +361,5 @@ def test_judgements_and_judges_describe_themselves_as_json() -> None:
     assert Judgement.from_info(json.loads(json.dumps(judgement.to_info()))) == judgement
     rules, both = RuleJudge().describe(), make_judge("rules").describe()
     assert json.loads(json.dumps(both)) == both and both["tiers"][0] == rules
-    assert rules["version"] == 1 and rules["vocabulary"] == load_vocabulary().digest
+    assert rules["version"] == 2 and rules["vocabulary"] == load_vocabulary().digest
     assert make_judge("approximate").describe() != both

@@ -141,7 +141,7 @@ def test_the_surest_detection_is_on_top() -> None:
         np.testing.assert_array_equal(found.category[view], expected)
         np.testing.assert_allclose(found.confidence[view], np.array([0, 0.5, 0.9], np.float32)[expected])
     assert not found.state.any() and not labeller.privileged
-    assert labeller.describe()["detector"] == "Squares"
+    assert labeller.describe()["detector"] == "Squares" and labeller.describe()["names"] == ["chair", "lamp"]
     with pytest.raises(ArgumentError, match="1 to 255 distinct names"):
         DetectorLabeller(Squares(), Whole(), ("chair", "chair"))
 

@@ -214,6 +214,7 @@ def test_what_it_cannot_use_is_named(checkpoint: Path, tmp_path: Path) -> None:
     ("make", "reason"),
     [
         (lambda network: b"nothing of the kind", "without running code"),
+        (lambda network: b"hello: unpickling says KeyError", "without running code"),
         (lambda network: {"model_state": Path("a class of its own")}, "without running code"),
         (lambda network: {"weights": {}}, "'model_state'"),
         (lambda network: {"model_state": {"fc.weight": torch.zeros(1)}}, "expected 'conv1.weight'"),
@@ -227,6 +228,14 @@ def test_other_checkpoints_are_refused(network: RedNet, tmp_path: Path, make: An
     else:
         torch.save(content, path)
     with pytest.raises(WeightsError, match=reason) as raised:
+        SEMANTICS.make("rednet", weights=path)
+    assert raised.value.kind == "unfit"
+
+
+def test_damaged_safetensors_are_refused(tmp_path: Path) -> None:
+    path = tmp_path / "rednet.safetensors"
+    path.write_bytes(b"hello")
+    with pytest.raises(WeightsError, match="expected RedNet's weights") as raised:
         SEMANTICS.make("rednet", weights=path)
     assert raised.value.kind == "unfit"
 

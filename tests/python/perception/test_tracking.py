@@ -115,6 +115,14 @@ def test_growth_keeps_the_seed_and_stays_in_what_was_not_seen(seed: int, shift: 
         np.testing.assert_array_equal(found, grow_mask(frame, own, unseen, wraps))
 
 
+def test_a_target_that_fills_the_frame_but_for_a_rim_is_left_as_it_is() -> None:
+    """Near a target no pixel is left to be background."""
+    frame = np.random.default_rng(0).integers(0, 255, (480, 480, 3), np.uint8)
+    own = np.zeros((480, 480), bool)
+    own[6:-6, 6:-6] = True
+    np.testing.assert_array_equal(grow_mask(frame, own, ~own, wraps=False), own)
+
+
 def test_a_hairline_is_no_sight_of_a_target() -> None:
     masks = np.zeros((3, 6, 8), bool)
     masks[0, 1:5, 3] = masks[1, 2, 1:6] = masks[2, 1:5, 3:5] = True

@@ -23,6 +23,7 @@ from wiw.experiments.privileged_explorers import (
     SPACING,
     OracleExplorer,
     OracleTourExplorer,
+    _rename,
     choose_places,
     look_from,
     take_tour,
@@ -37,6 +38,7 @@ from wiw.mapping.views import Views, place_cameras, unproject
 from wiw.perception.scene_labels import CATEGORIES, STATES, Labeller, SceneLabels
 from wiw.policies.explorer import confidence
 from wiw.policies.explorer.answering import answer, list_wanted
+from wiw.policies.explorer.destinations import Destination, _measure_way
 from wiw.policies.explorer.home import KNOWLEDGE, Home, Surface, believe_home, load_knowledge, to_table_frame
 from wiw.policies.explorer.policy import SURFACE_STRIDE, SURFACES, Explorer
 from wiw.policies.explorer.presuming import find_likeliest
@@ -485,3 +487,28 @@ def test_the_shipped_curves_never_fall():
     for curve in confidence.load_curves().values():
         assert curve["support"] == sorted(curve["support"]) and curve["right"] == sorted(curve["right"])
         assert 0 < curve["right"][0] <= curve["right"][-1] < 1
+
+
+def test_true_perception_knows_the_words_and_colors_of_scenes_from_files():
+    """Where a scene does not say a colour, it is seen; other words for a category mean the same."""
+    said = [
+        {"id": 1, "category": "couch", "attributes": {"color": "blue"}},
+        {"id": 2, "category": "cooking bench", "attributes": {}},
+    ]
+    instances = _rename(said)
+    assert [each["category"] for each in instances] == ["sofa", "stove"] and said[0]["category"] == "couch"
+    images = np.full((1, 2, 3, 3), 128, np.uint8)
+    images[0, 0] = PALETTE["red"]
+    ids = np.array([[[2, 2, 1], [1, 1, 0]]], np.uint32)
+    explorer = make_explorer()
+    painted = explorer._paint(images, ids, instances)
+    assert [explorer.name_color(painted[ids == number], "")[0] for number in (1, 2)] == ["blue", "red"]
+
+
+def test_what_lies_beyond_the_map_has_no_way():
+    grid = OccupancyGrid()
+    distances = np.ones((40, 40))
+    edge = grid.to_points(np.array([[0, 0]]))[0]
+    for offset in ([-5.0, 0.0], [0.0, -5.0], [-5.0, -5.0], [500.0, 0.0]):
+        place = Destination(edge + offset, 0.0, radius=1.0)
+        assert _measure_way(grid, distances, place) == np.inf

@@ -430,6 +430,19 @@ def test_another_policys_plans_are_ranked_and_the_question_is_asked_apart(two_ro
     assert "in primitives: " in words(policy.client.calls[0]) and len(images(policy.client.calls[1])) == 2
 
 
+def test_who_has_the_role_answers_a_question_that_is_asked_apart(two_rooms: str) -> None:
+    apart = MockClient(Script(command(answer="green")))
+    roles = {"answer": {"vlm": apart, "model": "b"}}
+    policy = make_policy(Script(command(answer="red")), revision="select", model="a", roles=roles)
+    task = AEQA(two_rooms)
+    env = task.environment(depth=True)
+    observation = env.begin(make_episode(two_rooms))
+    agent = wiw.Agent("heuristic", "copy", reviser=policy, **task.defaults)
+    assert agent.decide(observation, env.goal, Key(0, 0)).answer.text == "green"
+    assert [level(call) for call in apart.calls] == ["answer"]
+    assert [level(call) for call in policy.client.calls] == ["choose"]
+
+
 def test_decisions_do_not_depend_on_who_else_is_asked_for(two_rooms: str) -> None:
     task = AEQA(two_rooms)
     queries = []

@@ -26,6 +26,7 @@ from wiw.policies.explorer.policy import Explorer
 from wiw.runs.recipes import AgentRecipe, TaskRecipe
 from wiw.studies.run_log import load_run
 from wiw.tasks.aeqa import AEQA
+from wiw.tasks.answer_record import read_judgements
 from wiw.types import Answer, Episode, EpisodeResult, Goal, Proposal, TextAnswer
 
 SCENE = "apartments:val/1"
@@ -127,6 +128,27 @@ def test_episodes_without_an_answer_are_marked_as_the_rules_say(episode, monkeyp
     assert found["spl"] == (1.0 if spl_counts else 0.0) and found["success"] == 0
 
 
+@pytest.mark.parametrize(("rule", "cut"), [("blind", 1.0), ("blind_with_path", 1.0), ("lowest", 0.0)])
+def test_without_an_answer_the_anytime_curve_ends_at_the_score(episode, monkeypatch, rule, cut):
+    monkeypatch.setattr("wiw.tasks.aeqa.blind_answer", lambda text: "blue")
+    env = begin(episode, actions=1, unanswered=rule)
+    env.run([int(TURN_LEFT)], TextAnswer())
+    found = env.result()
+    assert [found[f"score_at_{at}"] for at in (30, 60, 120, 250)] == [cut] * 4
+    assert found["answer_score"] == cut
+
+
+def test_there_is_no_spl_where_the_shortest_walk_is_not_known(episode):
+    env = begin(replace(episode, geodesic=math.nan), confirm="none")
+    env.run([], final())
+    found = env.result()
+    assert found["success"] == 1 and found["path_length"] == 0
+    assert found.keys().isdisjoint({"spl", "shortest"})
+    outcome = {"arm": "a", "episode": 0, "status": "done", "metrics": found, "details": env.details()}
+    record = AEQA.read_answers({"unanswered": "blind"}, episode, outcome)
+    assert record is not None and "spl" not in record.compute_metrics(read_judgements(env.details()))
+
+
 def test_spl_is_the_papers(episode):
     env = begin(episode, confirm="none")
     env.run([int(FORWARD)] * 12, TextAnswer())
@@ -177,6 +199,9 @@ def test_stopping_ends_without_an_answer_and_an_answer_ends_what_is_stepped(epis
     assert stepped.answer("blue")["success"] == 1
     with pytest.raises(ArgumentError, match="reply to a question"):
         stepped.answer(" ")
+    with pytest.raises(ArgumentError, match="the episode has ended"):
+        stepped.answer("red")  # the first answer counts
+    assert stepped.result()["success"] == 1
 
 
 # -- what policies are given and must return ---------------------------------------------------------------------------

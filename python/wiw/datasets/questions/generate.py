@@ -226,10 +226,16 @@ def look_around(
 
 
 def find_questions(surroundings: Surroundings) -> list[Answerable]:
-    """Return every valid question of a scene, each text once, in the order of `answers.propose`."""
+    """Return every valid question of a scene, each text once, in the order of `answers.propose`.
+
+    Nothing is asked about what has a name that could not be told from the words around it, such as "cabinet left".
+    """
     found: dict[str, Answerable | None] = {}
     for template, slots in propose(surroundings.table):
-        text = phrase(template, slots)
+        try:
+            text = phrase(template, slots)
+        except ArgumentError:
+            continue
         if text not in found:
             found[text] = surroundings.ask(template, slots)
     return [each for each in found.values() if each is not None]

@@ -50,9 +50,11 @@ class Question:
     """Id of the episode that asks the same, from the same start, where something else is true; empty without one."""
 
     def __post_init__(self) -> None:
-        if not self.text.strip() or not self.answer.strip():
+        texts = (self.text, self.answer, *self.extra_answers)
+        if not all(any(character.isalnum() for character in text) for text in texts):
             raise ArgumentError(
-                f"expected a question and an answer with words in them, got {self.text!r}: {self.answer!r}"
+                f"expected a question and an answer with words in them, got {self.text!r}: "
+                f"{', '.join(repr(text) for text in texts[1:])}"
             )
         if self.category not in CATEGORIES:
             raise ArgumentError(f"category: expected one of {', '.join(CATEGORIES)}, got {self.category!r}")
@@ -90,7 +92,7 @@ class Question:
         try:
             return cls(
                 **{name: text(info[name], name) for name in _TEXTS if name in info},
-                extra_answers=tuple(text(each, "extra_answers") for each in info.get("extra_answers", ())),
+                extra_answers=_texts(info.get("extra_answers", ()), "extra_answers"),
                 slots={text(k, "slots"): text(v, "slots") for k, v in dict(info.get("slots", {})).items()},
                 target=tuple(integer(each, "target") for each in info.get("target", ())),
                 viewpoints=tuple(_viewpoint(each) for each in info.get("viewpoints", ())),
@@ -100,6 +102,12 @@ class Question:
 
 
 _TEXTS = ("text", "answer", "category", "answer_type", "template", "twin")
+
+
+def _texts(values: Any, name: str) -> tuple[str, ...]:
+    if not isinstance(values, list | tuple):
+        raise ValueError(f"{name}: expected a list of texts, got {values!r:.80}")
+    return tuple(text(each, name) for each in values)
 
 
 def _viewpoint(value: Any) -> Viewpoint:

@@ -67,7 +67,7 @@ class Survey:
 
     def _distances_to(self, table: SceneTable, instance: int) -> NDArray[np.float64]:
         """Return how far each place is from the bounds of an instance, straight and horizontally."""
-        thing = table.things[instance - 1]
+        thing = next(each for each in table.things if each.id == instance)  # a table may lack instances
         gaps = np.maximum(0.0, np.maximum(thing.low - self.points, self.points - thing.high))
         return np.hypot(gaps[:, 0], gaps[:, 2])
 

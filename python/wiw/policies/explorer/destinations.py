@@ -97,5 +97,6 @@ def _measure_way(grid: OccupancyGrid, distances: NDArray[np.float64], place: Des
     """Return the metres to a place, or to the nearest one around it from where it is looked at; inf without a way."""
     reach = max(1, round(place.radius / 0.1))
     row, column = (int(cell[0]) for cell in grid.to_cells(place.position[None]))
-    box = distances[max(0, row - reach) : row + reach + 1, max(0, column - reach) : column + reach + 1]
+    rows, columns = (slice(max(0, cell - reach), max(0, cell + reach + 1)) for cell in (row, column))
+    box = distances[rows, columns]
     return float(box.min(initial=np.inf))

@@ -286,7 +286,7 @@ class QuestionVLM(VLM):
     ) -> list[TextAnswer]:
         """Return the planner's answers, as final ones; where another policy has proposed, the question is asked now."""
         replies = self._ask_each(
-            [[] if _get_answer(each) is not None else [self._build_question(each)] for each in situations]
+            [[] if _get_answer(each) is not None else [self._build_question(each)] for each in situations], "answer"
         )
         for situation, own in zip(situations, replies, strict=True):
             for reply in own:
