@@ -24,18 +24,22 @@ from wiw.analysis.breakdowns import Breakdown
 from wiw.analysis.data_scaling import EQUAL_UPDATES, FEWER_SCENES, ONE_EPOCH, ScalingTable
 from wiw.analysis.errors import METRES, PSNR, ErrorLine, ErrorTable
 from wiw.analysis.fidelity import ArmFidelity
-from wiw.analysis.intervals import wilson
 from wiw.analysis.marks import BLIND
 from wiw.analysis.quality import QualityTable
+from wiw.analysis.statistics import estimate_mean
 from wiw.analysis.summary import Summary
 from wiw.metrics.metric import SUCCESS
+from wiw.scenes import strip_edits
 from wiw.types import Wording
 
 LONGEST_LINE = 16
 """Characters of an arm's name beside an axis."""
 INK = "#010203"
 """Stands for the page's text colour."""
-PALETTE = ("#4c78a8", "#8e6bbf", "#d1495b", "#17899b", "#b5651d", "#5a7d2a")
+PALETTE = (
+    "#4c78a8", "#8e6bbf", "#d1495b", "#17899b", "#b5651d", "#5a7d2a",
+    "#d977b0", "#3949ab", "#7c6f00", "#e8743b", "#00a884", "#8d5a4a",
+)  # fmt: skip
 ROLE_COLORS = {"none": "#8b9099", "copy": "#c98a2b", "oracle": "#2e9e6b", BLIND: "#a39a86"}
 BLAME_COLORS = {
     "imagination": "#4c78a8",
@@ -398,16 +402,14 @@ def _draw_binned_rates(axes: Axes, outcomes: Outcomes, colors: Mapping[str, str]
     for shift, (arm, rows) in enumerate(outcomes.items()):
         ways = np.array([row["geodesic"] for row in rows])
         reached = np.array([row["metrics"].get("success", 0.0) for row in rows])
+        scenes = np.array([strip_edits(row["scene"]) for row in rows])
         which = np.clip(np.searchsorted(edges, ways, side="right") - 1, 0, len(edges) - 2)
-        points = [(i, reached[which == i]) for i in range(len(edges) - 1) if (which == i).any()]
+        bins = [i for i in range(len(edges) - 1) if (which == i).any()]
+        rates = [estimate_mean(reached[which == i], scenes[which == i].tolist(), SUCCESS) for i in bins]
         offset = 0.03 * span * (shift - (len(outcomes) - 1) / 2)
-        x = [(edges[i] + edges[i + 1]) / 2 + offset for i, _ in points]
-        y = [100 * values.mean() for _, values in points]
-        spans = [wilson(float(values.mean()), len(values)) for _, values in points]
-        bars = [
-            [value - 100 * low for value, (low, _) in zip(y, spans, strict=True)],
-            [100 * high - value for value, (_, high) in zip(y, spans, strict=True)],
-        ]
+        x = [(edges[i] + edges[i + 1]) / 2 + offset for i in bins]
+        y = [rate.value for rate in rates]
+        bars = [[rate.value - rate.low for rate in rates], [rate.high - rate.value for rate in rates]]
         axes.errorbar(
             x,
             y,

@@ -8,7 +8,9 @@ from html.parser import HTMLParser
 import numpy as np
 import pytest
 from fakes import LineAgent, LineTask
+from matplotlib.axes import Axes
 
+from wiw.analysis.intervals import wilson
 from wiw.analysis.summary import summarise
 from wiw.errors import ArgumentError
 from wiw.report.episodes import read_stories
@@ -213,7 +215,9 @@ def test_an_arm_with_errors_alone_is_left_out_of_the_plot_of_ranks(tmp_path):
 
 def list_ways(arms, length):
     """Return 30 ended episodes, the i-th with a path of `length(i)` metres, the same of each arm."""
-    rows = [{"geodesic": length(i), "metrics": {"success": float(i % 3 == 0)}} for i in range(30)]
+    rows = [
+        {"geodesic": length(i), "scene": f"s{i % 10}", "metrics": {"success": float(i % 3 == 0)}} for i in range(30)
+    ]
     return dict.fromkeys(arms, rows)
 
 
@@ -234,6 +238,24 @@ def test_equally_long_paths_are_one_bin_with_the_arms_beside_each_other():
     uneven = success_by_distance(list_ways(["none", "warp"], lambda i: 4.0 + (i >= 15)), Wording())
     marker = re.compile(r'<use [^>]*x="([\d.]+)"[^>]*style="fill: #(?:8b9099|4c78a8)')
     assert [len(set(marker.findall(each))) for each in (drawn, uneven)] == [4, 6]  # of which two in the legend
+
+
+def test_rates_by_distance_have_intervals_over_scenes(monkeypatch):
+    """Episodes of a scene that all end alike say little more than one of them."""
+    drawn = []
+    monkeypatch.setattr(Axes, "errorbar", lambda self, x, y, yerr, **style: drawn.append((y, np.array(yerr))))
+    rows = [
+        {
+            "geodesic": 4.0,
+            "scene": f"apartments:val/{i // 10}?state:floor_lamp_{i}=off",
+            "metrics": {"success": float(i < 20)},
+        }
+        for i in range(40)
+    ]
+    success_by_distance({"none": rows}, Wording())
+    ((rate,), ((below,), (above,))) = drawn[0]
+    low, high = wilson(0.5, 40)
+    assert rate == 50 and below > 1.5 * (50 - 100 * low) and above > 1.5 * (100 * high - 50)
 
 
 def test_plots_of_many_arms_have_room_for_their_names():
