@@ -83,7 +83,8 @@ class PoseGrid:
     turns: int = 120
 
     def __post_init__(self) -> None:
-        if not all(low < high for low, high in zip(self.low, self.high, strict=True)) or min(self.bins, self.turns) < 1:
+        ordered = len(self.low) == len(self.high) == 3 and all(np.less(self.low, self.high))
+        if not ordered or min(self.bins, self.turns) < 1:
             raise ArgumentError(
                 f"PoseGrid: expected low < high, 3 metres each, and at least one bin and turn, got {self.low}, "
                 f"{self.high}, {self.bins} and {self.turns}"

@@ -156,6 +156,11 @@ class EpisodeRules:
     nearby: float = 3.0
     """... from at most this far away, so that it is hard for its side alone."""
 
+    def __post_init__(self) -> None:
+        for name in ("survey", "places", "attempts"):
+            if getattr(self, name) < 1:
+                raise ArgumentError(f"ar: {name}: expected at least 1, got {getattr(self, name)}")
+
 
 @dataclass(frozen=True)
 class Survey:

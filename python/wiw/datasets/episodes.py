@@ -13,7 +13,7 @@ from pathlib import Path
 from typing import Any
 
 from wiw.datasets import habitat
-from wiw.datasets.fields import integer, number, point, text
+from wiw.datasets.fields import integer, length, number, point, positive, text
 from wiw.errors import ArgumentError, FileError
 from wiw.json_text import parse_json
 from wiw.scenes import absolute, is_generated, resolve
@@ -134,7 +134,7 @@ def _info(info: Any) -> dict[str, Any]:
 
 
 def _length(value: Any, name: str) -> float:
-    return math.nan if value is None else number(value, name)
+    return math.nan if value is None else length(value, name)
 
 
 _FIELDS: Mapping[str, Callable[[Any, str], Any]] = {
@@ -146,5 +146,10 @@ _FIELDS: Mapping[str, Callable[[Any, str], Any]] = {
     "goal_yaw": number,
     "geodesic": _length,
 }
-_INFO: Mapping[str, Callable[[Any, str], Any]] = {"ideal_primitives": integer, "radius": number, "best_position": point}
+_INFO: Mapping[str, Callable[[Any, str], Any]] = {
+    "ideal_primitives": integer,
+    "radius": positive,
+    "goal_image": text,
+    "best_position": point,
+}
 """Fields that tasks compute with."""

@@ -29,6 +29,20 @@ def number(value: Any, name: str) -> float:
     return float(value)
 
 
+def length(value: Any, name: str) -> float:
+    """Return a finite number of at least 0."""
+    if number(value, name) < 0:
+        raise ValueError(f"{name}: expected a number of at least 0, got {value!r:.80}")
+    return float(value)
+
+
+def positive(value: Any, name: str) -> float:
+    """Return a finite number above 0."""
+    if number(value, name) <= 0:
+        raise ValueError(f"{name}: expected a number above 0, got {value!r:.80}")
+    return float(value)
+
+
 def integer(value: Any, name: str) -> int:
     """Return an integer of at least 0."""
     if number(value, name) != int(value) or value < 0:

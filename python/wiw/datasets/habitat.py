@@ -13,7 +13,7 @@ from typing import Any, Literal
 import numpy as np
 
 from wiw._core import core
-from wiw.datasets.fields import name_of, number, point, text
+from wiw.datasets.fields import length, name_of, number, point, positive, text
 from wiw.errors import FileError
 from wiw.types import Episode
 
@@ -79,13 +79,19 @@ def _habitat(item: Mapping[str, Any], objects: Any, where: str) -> Episode:
             start_yaw=yaw_of(item["start_rotation"], "xyzw", where),
             goal_position=point(goal["position"], "goals[0].position"),
             goal_yaw=yaw,
-            geodesic=float("nan" if found else item.get("info", {}).get("geodesic_distance", "nan")),
+            geodesic=float("nan") if found else _read_geodesic(item),
             info={"source": "habitat", "goal_heading": "file" if rotation is not None else "episode id", **found},
         )
     except _UNREADABLE as error:
         raise FileError(
             f"{where}: not a navigation episode of habitat-lab ({type(error).__name__}: {error})"
         ) from error
+
+
+def _read_geodesic(item: Mapping[str, Any]) -> float:
+    """Return the length of an episode's shortest path; NaN where habitat-lab has left it, or all of `info`, out."""
+    given = (item.get("info") or {}).get("geodesic_distance")
+    return float("nan") if given is None else length(given, "info.geodesic_distance")
 
 
 def _find_view_point(item: Mapping[str, Any], objects: Any) -> tuple[Mapping[str, Any], dict[str, str]]:
@@ -129,7 +135,7 @@ def _world_in_world(item: Mapping[str, Any], where: str, folder: Path) -> Episod
             geodesic=float("nan"),
             info={
                 "source": PUBLISHED,
-                "radius": number(item["goal_radius"], "goal_radius"),
+                "radius": positive(item["goal_radius"], "goal_radius"),
                 **({} if steps is None else {"ideal_primitives": int(steps)}),
                 **({} if picture is None else {"goal_image": picture}),
             },

@@ -74,6 +74,8 @@ class EpisodeRules:
     """near, far or beyond (`TIERS`), which sets shortest, longest and budget; all: the three in turn; any: none."""
 
     def __post_init__(self) -> None:
+        if self.attempts < 1:
+            raise ArgumentError(f"imagenav: attempts: expected at least 1, got {self.attempts}")
         given = [
             name for name in ("shortest", "longest", "budget") if getattr(self, name) != getattr(EpisodeRules, name)
         ]

@@ -118,13 +118,40 @@ class Env(ABC):
         return ArgumentError(f"{name} {what}; use something else, or implement `{name}.{method}`")
 
 
-def read_episode_option(options: Mapping[str, Any] | None) -> Any:
+def read_episode_number(options: Mapping[str, Any] | None) -> int | None:
     """Return the "episode" of gymnasium's reset options; None if not given.
 
     Raises:
-        ArgumentError: another option.
+        ArgumentError: another option, or no whole number of at least 0.
     """
+    given = _read_episode_option(options)
+    return None if given is None else _require_number(given)
+
+
+def read_episode_numbers(options: Mapping[str, Any] | None, count: int) -> list[int] | None:
+    """Return the "episode" of a vector environment's reset options, one for each of `count` places; None if not given.
+
+    Raises:
+        ArgumentError: another option, or no list of as many whole numbers of at least 0.
+    """
+    given = _read_episode_option(options)
+    if given is None:
+        return None
+    if np.ndim(given) != 1:
+        raise ArgumentError(f"reset: expected a list of {count} episodes, one for each place, got {given!r}")
+    if len(given) != count:
+        raise ArgumentError(f"reset: expected {count} episodes, got {len(given)}")
+    return [_require_number(each) for each in given]
+
+
+def _read_episode_option(options: Mapping[str, Any] | None) -> Any:
     given = options or {}
     if unknown := [str(name) for name in given if name != "episode"]:
         raise ArgumentError(f"reset: unknown option '{unknown[0]}'; the only option is 'episode', the episode's number")
     return given.get("episode")
+
+
+def _require_number(given: Any) -> int:
+    if isinstance(given, bool) or not isinstance(given, int | np.integer) or given < 0:
+        raise ArgumentError(f"reset: expected an episode number, a whole number of at least 0, got {given!r}")
+    return int(given)

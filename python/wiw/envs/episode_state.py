@@ -62,6 +62,11 @@ class NavigationSpec(ABC):
         """How many episodes there are; None if there is no end of them."""
 
     @property
+    def drawn_count(self) -> int:
+        """Among how many episodes, the first ones, a seed of gymnasium's `reset` draws."""
+        return self.episode_count or 64
+
+    @property
     def pointing(self) -> Pointing | None:
         """How the task points its target out, where it has one."""
         return None
@@ -212,8 +217,8 @@ def count_leading_turns(plan: Any) -> int:
 
 
 def draw_episode(task: NavigationSpec, random: np.random.Generator) -> int:
-    """Return a random episode's number; among the first 64 if there is no end of them."""
-    return int(random.integers(task.episode_count or 64))
+    """Return a random episode's number."""
+    return int(random.integers(task.drawn_count))
 
 
 def wrap_episode(task: NavigationSpec, index: int) -> int:

@@ -13,7 +13,7 @@ from gymnasium import spaces
 from numpy.typing import ArrayLike, NDArray
 
 from wiw.action import PoseGrid
-from wiw.envs.base import Env, Segment, read_episode_option
+from wiw.envs.base import Env, Segment, read_episode_number
 from wiw.envs.manipulation_spec import ManipulationSpec
 from wiw.envs.sensors import Sensors
 from wiw.envs.table_guide import TableGuide
@@ -74,6 +74,7 @@ class ManipulationEnv(gymnasium.Env[dict[str, Any], NDArray[np.float64]], Env):
         self._drawn: dict[str, dict[str, NDArray[Any]]] = {}
         self._taken = self._decisions = self._next = 0
         self._refused: list[str] = []
+        self._over = False
         self._key = Key(task.seed, 0)
 
     # -- gymnasium -----------------------------------------------------------------------------------------------------
@@ -84,14 +85,14 @@ class ManipulationEnv(gymnasium.Env[dict[str, Any], NDArray[np.float64]], Env):
         """Start an episode: `options={"episode": 3}`, or the next one; `seed` draws one at random.
 
         Raises:
-            ArgumentError: an unknown option, or a negative number of an episode.
+            ArgumentError: an unknown option, or no whole number of at least 0.
         """
         super().reset(seed=seed)
-        index = read_episode_option(options)
+        index = read_episode_number(options)
         if index is None:
             index = int(self.np_random.integers(1000)) if seed is not None else self._next
-        self.begin(self.task.episode(int(index)))
-        self._next, self._key = int(index) + 1, Key(self.task.seed, int(index))
+        self.begin(self.task.episode(index))
+        self._next, self._key = index + 1, Key(self.task.seed, index)
         info = {"key": self._key, "instruction": self.goal.text, "objects": tuple(self.table.objects)}
         return self._read_sensors(), info
 
@@ -99,8 +100,8 @@ class ManipulationEnv(gymnasium.Env[dict[str, Any], NDArray[np.float64]], Env):
         """Go to one pose, which counts as one decision.
 
         Raises:
-            ArgumentError: no finite pose [7] with a gripper from 0 to 1, nor, with `grid`, whole numbers [7]; nothing
-                has moved then.
+            ArgumentError: no finite pose [7] with a gripper from 0 to 1, nor, with `grid`, whole numbers [7]; or the
+                episode has ended; nothing has moved then.
         """
         pose = np.asarray(action, np.float64) if self.grid is None else self.grid.decode(action)
         segment = self.run(pose[None])
@@ -119,16 +120,18 @@ class ManipulationEnv(gymnasium.Env[dict[str, Any], NDArray[np.float64]], Env):
         """Start a given episode and observe."""
         self._table = self.task.set_table(episode)
         self._taken = self._decisions = 0
-        self._refused = []
+        self._refused, self._over = [], False
         return self._observe()
 
     def run(self, plan: ArrayLike, answer: Answer | TextAnswer | None = None) -> Segment:
         """Carry out one decision's poses [K, 7], as far as the episode continues; observe once, at the end.
 
         Raises:
-            ArgumentError: as `check_poses`; nothing has moved then.
+            ArgumentError: as `check_poses`, or the episode has ended; nothing has moved then.
         """
         table, poses, executed, refused = self.table, check_poses(plan), [], []
+        if self._over:
+            raise ArgumentError("run: the episode has ended; call reset() to start another")
         path = [table.bench.pose[:3]]
         for pose in poses[: self.task.actions - self._taken]:
             move = table.bench.move_to(pose)
@@ -143,6 +146,7 @@ class ManipulationEnv(gymnasium.Env[dict[str, Any], NDArray[np.float64]], Env):
         self._key = self._key.at(self._key.decision + 1)
         done = table.is_success()
         over = not done and self._taken >= self.task.actions
+        self._over = done or over
         taken = np.array(executed).reshape(-1, 7)
         return Segment(self._observe(), taken, np.stack(path), done, over, self._key, tuple(refused))
 

@@ -14,7 +14,7 @@ from gymnasium.vector.utils import batch_space
 from numpy.typing import ArrayLike, NDArray
 
 from wiw._core import core
-from wiw.envs.base import read_episode_option
+from wiw.envs.base import read_episode_numbers
 from wiw.envs.manipulation import ManipulationEnv, check_poses
 from wiw.envs.manipulation_spec import ManipulationSpec
 from wiw.errors import ArgumentError
@@ -60,17 +60,19 @@ class ManipulationVectorEnv(gymnasium.vector.VectorEnv[dict[str, Any], NDArray[A
     def reset(
         self, *, seed: int | None = None, options: dict[str, Any] | None = None
     ) -> tuple[dict[str, Any], dict[str, Any]]:
-        """Start N episodes: `options={"episode": [3, 5]}`, or the next ones; `seed` draws a first one at random."""
+        """Start N episodes: `options={"episode": [3, 5]}`, or the next ones; `seed` draws a first one at random.
+
+        Raises:
+            ArgumentError: an unknown option, or no list of N whole numbers of at least 0.
+        """
         super().reset(seed=seed)
-        indices = read_episode_option(options)
+        indices = read_episode_numbers(options, self.num_envs)
         if indices is None:
             first = int(self.np_random.integers(1000)) if seed is not None else self._next
-            indices = range(first, first + self.num_envs)
-        if len(indices) != self.num_envs:
-            raise ArgumentError(f"reset: expected {self.num_envs} episodes, got {len(indices)}")
-        begun = self._each(lambda place: self._begin(place, int(indices[place])))
+            indices = list(range(first, first + self.num_envs))
+        begun = self._each(lambda place: self._begin(place, indices[place]))
         self._over[:] = False
-        self._next = max(map(int, indices)) + 1
+        self._next = max(indices) + 1
         return self._stack([observation for observation, *_ in begun]), self._merge_infos([info for *_, info in begun])
 
     def step(

@@ -10,7 +10,7 @@ import gymnasium
 import numpy as np
 from numpy.typing import NDArray
 
-from wiw.envs.base import Env, Segment, read_episode_option
+from wiw.envs.base import Env, Segment, read_episode_number
 from wiw.envs.episode_state import (
     EpisodeState,
     NavigationSpec,
@@ -20,7 +20,14 @@ from wiw.envs.episode_state import (
     wrap_episode,
 )
 from wiw.envs.navigation_guide import NavigationGuide, ShortestPath
-from wiw.envs.spaces import FIRST_ACTION, LAST_PRIMITIVE, action_space, answer_of, observation_space
+from wiw.envs.spaces import (
+    FIRST_ACTION,
+    LAST_PRIMITIVE,
+    action_space,
+    answer_of,
+    check_primitives,
+    observation_space,
+)
 from wiw.errors import ArgumentError
 from wiw.perception.semantics import TrueSemantics
 from wiw.perception.simulator import read_categories
@@ -65,13 +72,13 @@ class NavigationEnv(gymnasium.Env[dict[str, Any], int], Env):
         `info["key"]` identifies the next decision, for `agent.decide`; every step returns a new one.
 
         Raises:
-            ArgumentError: an unknown option, or a negative episode number.
+            ArgumentError: an unknown option, or no whole number of at least 0.
         """
         super().reset(seed=seed)
-        index = read_episode_option(options)
+        index = read_episode_number(options)
         if index is None:
             index = draw_episode(self.task, self.np_random) if seed is not None else self._next
-        index = wrap_episode(self.task, int(index))
+        index = wrap_episode(self.task, index)
         observation = self.begin(self.task.episode(index))
         self._next = index + 1
         self._key = Key(self.task.seed, index)
@@ -82,13 +89,14 @@ class NavigationEnv(gymnasium.Env[dict[str, Any], int], Env):
         on).
 
         Raises:
-            ArgumentError: another number; nothing has moved then.
+            ArgumentError: another number, or the episode has ended; nothing has moved then.
         """
         if not self.action_space.contains(action):
             most = LAST_PRIMITIVE + len(self.task.choices)
             raise ArgumentError(
                 f"step: expected an action from {FIRST_ACTION} to {most}, as wiw.action has them, got {action!r}"
             )
+        self._require_going("step")
         answer = answer_of(int(action), self.task.choices)
         if answer is not None:
             self.state.record_answer(self.task, answer, final=True)
@@ -116,26 +124,31 @@ class NavigationEnv(gymnasium.Env[dict[str, Any], int], Env):
         If the goal expects an answer, `answer` comes first, and nothing is executed after a final one.
 
         Raises:
-            ArgumentError: the goal expects an answer and none is given.
+            ArgumentError: no primitives [K] of `wiw.action`, no answer where the goal expects one, or the episode has
+                ended; nothing has moved or been counted then.
         """
-        self.state.decisions += 1
+        actions = check_primitives(plan)
+        self._require_going("run")
         if answer is None and self.goal.expects_answer:
             raise ArgumentError(
                 "run: the goal expects an answer; pass the decision's answer as well, run(plan, answer)"
             )
+        self.state.decisions += 1
         stays = answer is not None and self.state.record_answer(self.task, answer)
-        return self._carry_out([] if stays else self.state.limit_plan(self.task, plan))
+        return self._carry_out([] if stays else self.state.limit_plan(self.task, actions))
 
     def answer(self, text: str) -> dict[str, float]:
         """End the episode with an answer in words, for callers who step it themselves; return its metrics.
 
         Raises:
-            ArgumentError: the goal is not a question, or the text is empty.
+            ArgumentError: the goal is not a question, the text is empty, or the episode has been ended before.
         """
         if not self.goal.question or not text.strip():
             raise ArgumentError(
                 f"answer: expected a text in reply to a question, got {text!r} in task {self.task.name}"
             )
+        if self.state.ended:  # an episode whose budget is used up may still be answered
+            raise ArgumentError("answer: the episode has ended; call reset() to start another")
         self.state.record_answer(self.task, TextAnswer(text, 1.0, final=True), final=True)
         return self.result()
 
@@ -225,3 +238,7 @@ class NavigationEnv(gymnasium.Env[dict[str, Any], int], Env):
     def _require_episode(self) -> None:
         if self._state is None:
             raise ArgumentError("the environment has no episode yet; call reset() first")
+
+    def _require_going(self, method: str) -> None:
+        if self.state.ended or self.state.is_out_of_budget(self.task):
+            raise ArgumentError(f"{method}: the episode has ended; call reset() to start another")

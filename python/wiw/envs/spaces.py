@@ -13,8 +13,10 @@ from typing import Any
 import gymnasium
 import numpy as np
 from gymnasium.vector.utils import batch_space
+from numpy.typing import ArrayLike, NDArray
 
 from wiw.action import FORWARD, STOP
+from wiw.errors import ArgumentError
 from wiw.types import Answer
 
 FIRST_ACTION, LAST_PRIMITIVE = int(FORWARD), int(STOP)
@@ -30,6 +32,22 @@ def answer_of(action: int, choices: tuple[str, ...]) -> Answer | None:
     """Return the final answer that an action stands for; None for a primitive."""
     choice = action - LAST_PRIMITIVE - 1
     return None if choice < 0 else Answer(choices, np.eye(len(choices))[choice])
+
+
+def check_primitives(plan: ArrayLike) -> NDArray[np.int8]:
+    """Return a plan of primitives as int8 [K]; K may be 0.
+
+    Raises:
+        ArgumentError: another shape, or something else than the primitives from 1 to 4.
+    """
+    given = np.asarray(plan)
+    whole = given.size == 0 or given.dtype.kind in "iu"
+    if given.ndim != 1 or not whole or ((given < FIRST_ACTION) | (given > LAST_PRIMITIVE)).any():
+        raise ArgumentError(
+            f"run: expected primitives [K] from {FIRST_ACTION} to {LAST_PRIMITIVE}, as wiw.action has them, got "
+            f"{plan!r}"
+        )
+    return given.astype(np.int8)
 
 
 @cache

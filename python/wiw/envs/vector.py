@@ -13,7 +13,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from wiw._core import env as _env
 from wiw.action import NULL
-from wiw.envs.base import read_episode_option
+from wiw.envs.base import read_episode_numbers
 from wiw.envs.episode_state import (
     EpisodeState,
     NavigationSpec,
@@ -70,23 +70,25 @@ class VectorEnv(gymnasium.vector.VectorEnv[dict[str, Any], NDArray[np.int64], ND
     def reset(
         self, *, seed: int | None = None, options: dict[str, Any] | None = None
     ) -> tuple[dict[str, Any], dict[str, Any]]:
-        """Start N episodes: `options={"episode": [3, 5]}`, or the next ones; `seed` draws a first one at random."""
+        """Start N episodes: `options={"episode": [3, 5]}`, or the next ones; `seed` draws a first one at random.
+
+        Raises:
+            ArgumentError: an unknown option, or no list of N whole numbers of at least 0.
+        """
         super().reset(seed=seed)
-        indices = read_episode_option(options)
-        if indices is None:
+        numbers = read_episode_numbers(options, self.num_envs)
+        if numbers is None:
             first = draw_episode(self.task, self.np_random) if seed is not None else self._next
-            indices = range(first, first + self.num_envs)
-        if len(indices) != self.num_envs:
-            raise ArgumentError(f"reset: expected {self.num_envs} episodes, got {len(indices)}")
-        indices = [wrap_episode(self.task, int(index)) for index in indices]
-        started = [start_episode(self.task, self.task.episode(int(index))) for index in indices]
+            numbers = list(range(first, first + self.num_envs))
+        indices = [wrap_episode(self.task, number) for number in numbers]
+        started = [start_episode(self.task, self.task.episode(index)) for index in indices]
         self._core = _env.VectorEnv([core for core, _, _ in started])
         self._states, self._goals = [state for _, state, _ in started], [goal for _, _, goal in started]
         self._over[:] = False
-        self._next = max(map(int, indices)) + 1
+        self._next = max(numbers) + 1  # not of `indices`: after a wrap the next one is not the first again
         infos: dict[str, Any] = {}
         for place, index in enumerate(indices):
-            self._add_info(infos, self._info(int(index)), place)
+            self._add_info(infos, self._info(index), place)
         return self._observe(), infos
 
     def step(
@@ -107,6 +109,7 @@ class VectorEnv(gymnasium.vector.VectorEnv[dict[str, Any], NDArray[np.int64], ND
                 state.record_primitive(self.task, int(primitives[place]), self._core[place].position, at_decision=True)
             else:
                 state.record_answer(self.task, answer, final=True)
+            state.observed.append(len(state.positions) - 1)
         observation = self._observe()
         for place in np.flatnonzero(~self._over):
             state = self._states[place]

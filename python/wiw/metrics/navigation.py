@@ -7,6 +7,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from wiw._core import metrics as _core
+from wiw.errors import ArgumentError
 
 
 def success_rate(success: ArrayLike) -> float:
@@ -16,9 +17,13 @@ def success_rate(success: ArrayLike) -> float:
         success: [N] booleans or numbers in [0, 1].
 
     Raises:
-        ArgumentError: no episode, or a value that is not finite.
+        ArgumentError: no episode, or a value that is not from 0 to 1.
     """
-    return 100.0 * float(_core.mean(_numbers(success)))
+    values = _numbers(success)
+    outside = values[~((values >= 0) & (values <= 1))]
+    if outside.size:
+        raise ArgumentError(f"success: expected booleans or numbers from 0 to 1, not percent, got {outside[0]:g}")
+    return 100.0 * float(_core.mean(values))
 
 
 def path_efficiency(success: ArrayLike, shortest: ArrayLike, travelled: ArrayLike) -> NDArray[np.float64]:

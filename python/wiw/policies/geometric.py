@@ -50,10 +50,14 @@ class Geometric(Matcher):
     """
 
     def begin(self, goal: Goal, key: Key) -> GeometricMemory:
-        """Extract features of the goal image; start with an empty map."""
-        assert goal.image is not None
-        points, descriptors = _extract_features(cv2.resize(goal.image, (VIEW, VIEW), interpolation=cv2.INTER_AREA))
-        return GeometricMemory(appearance.build_goal_template(goal.image), keypoints=points, descriptors=descriptors)
+        """Extract features of the goal image; start with an empty map.
+
+        Raises:
+            ArgumentError: the goal has no image.
+        """
+        image = self._require_goal_image(goal)
+        points, descriptors = _extract_features(cv2.resize(image, (VIEW, VIEW), interpolation=cv2.INTER_AREA))
+        return GeometricMemory(appearance.build_goal_template(image), keypoints=points, descriptors=descriptors)
 
     def observe(self, situations: Sequence[Situation]) -> None:
         """Observe as the matcher; besides, solve for the goal camera, and keep the answer with most inliers."""

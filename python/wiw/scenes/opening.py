@@ -12,7 +12,7 @@ from typing import Any
 
 from wiw import _core
 from wiw.errors import FileError
-from wiw.scenes import isolated, store
+from wiw.scenes import basis, isolated, store
 from wiw.scenes.apartments import apartment, apartment_table
 from wiw.scenes.scans import formats
 from wiw.scenes.specs import is_generated, parse_single
@@ -70,6 +70,8 @@ def load(
         "texture_folders": [str(Path(folder).expanduser().absolute()) for folder in texture_folders],
         "model_folders": [str(Path(folder).expanduser().absolute()) for folder in model_folders],
     }
+    if not basis.has_decoder():  # what is imported without it is another scene, and must not outlive its installation
+        options["basis_decoder"] = False
     reader = formats.find_reader(file)
     if reader is not None:
         options |= {"scan": reader, "allow_missing_textures": missing_textures_allowed()}

@@ -18,6 +18,7 @@ from wiw.datasets.worlds import World
 from wiw.envs.episode_state import EpisodeState
 from wiw.errors import ArgumentError, FileError
 from wiw.metrics import path_efficiency
+from wiw.scenes import resolve
 from wiw.tasks.navigation import NavigationTask
 from wiw.typed_values import require_positive
 from wiw.types import Episode, Goal, Wording
@@ -122,11 +123,48 @@ class ImageNav(NavigationTask):
         }
 
     def load_episodes(self) -> list[Episode]:
-        """Return the file's episodes, under the task's radius where that was given as an option."""
+        """Return the file's episodes, under the task's radius where that was given as an option.
+
+        Raises:
+            FileError: see `wiw.datasets.episodes.load`; an episode is of another task.
+        """
         loaded = super().load_episodes()
+        for i, episode in enumerate(loaded):
+            if other := [name for name in ("target", "question") if name in episode.info]:
+                raise FileError(
+                    f"{self.episode_file}: episode {i} has a {other[0]}, so it is one of another task (ar, aeqa); "
+                    "expected episodes that end at a place, see `wiw episodes imagenav`"
+                )
         if "radius" not in self.overridden:
             return loaded
         return [replace(e, info={name: value for name, value in e.info.items() if name != "radius"}) for e in loaded]
+
+    def episode(self, index: int) -> Episode:
+        """Return episode `index`; of generated ones only its block is made, as none depends on those before it.
+
+        Raises:
+            ArgumentError: a negative number, or there are fewer.
+        """
+        if index < 0 or index < len(self._episodes) or not self._has_own_blocks:
+            return super().episode(index)
+        number = index // self.block
+        if number not in self._blocks:
+            scenes = resolve(self.scenes)
+            if 1 < len(scenes) <= number:
+                return super().episode(index)  # which says how many there are
+            self._blocks[number] = self.generate_block(scenes, number, [])
+        return self._blocks[number][index % self.block]
+
+    @property
+    def _has_own_blocks(self) -> bool:
+        """Whether episodes are generated as here, not in another way by a class derived from this one."""
+        names = ("episodes", "generate_first", "generate_block", "generate_episodes")
+        return not self.episode_file and all(getattr(type(self), name) is getattr(ImageNav, name) for name in names)
+
+    @property
+    def drawn_count(self) -> int:
+        """Among how many episodes a seed draws: any, as no episode depends on those before it."""
+        return self.episode_count or 64 if self._has_own_blocks else super().drawn_count
 
     @property
     def block(self) -> int:

@@ -3,10 +3,12 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import asdict, replace
 from pathlib import Path
 from typing import Any, Literal
+
+import numpy as np
 
 from wiw.datasets import episodes as episode_file
 from wiw.datasets.worlds import World, navmesh_file, world
@@ -40,7 +42,8 @@ class NavigationTask(NavigationSpec, Task):
         rules: rules of the task, and of the generator (`generator_class`).
 
     Raises:
-        ArgumentError: rules that are not known, or options that an episode file leaves no use for.
+        ArgumentError: rules that are not known, a `per_scene` below 1, or options that an episode file leaves no use
+            for.
     """
 
     rules_class: type
@@ -71,11 +74,15 @@ class NavigationTask(NavigationSpec, Task):
         self._require_use({"scenes": scenes, "per_scene": per_scene, **given}, episode_file, scene_folder)
         self._generator_rules = {**self.preset_settings.generator, **given}
         self.generator: Any = presets.load_rules(self.generator_class, "", presets.DEFAULT, self._generator_rules)
+        if per_scene is not None and (not isinstance(per_scene, int | np.integer) or per_scene < 1):
+            raise ArgumentError(f"{self.name}: per_scene: expected a whole number of at least 1, got {per_scene!r}")
         self.scenes, self.seed = absolute(DEFAULT_SCENES if scenes is None else scenes), check_seed(seed)
         self.backend, self.per_scene = backend, DEFAULT_PER_SCENE if per_scene is None else per_scene
         self.episode_file = None if episode_file is None else str(Path(episode_file).expanduser().absolute())
         self.scene_folder = str(Path(scene_folder).expanduser().absolute()) if scene_folder else ""
         self._episodes: list[Episode] = []
+        self._blocks: dict[int, list[Episode]] = {}
+        """Generated blocks by number, where they are made one by one."""
 
     def _require_use(self, generating: Mapping[str, Any], file: str | Path | None, folder: str | Path) -> None:
         """Refuse options of generated episodes beside a file of episodes, and the folder of its scenes without one."""
@@ -146,6 +153,14 @@ class NavigationTask(NavigationSpec, Task):
         return None if len(scenes) == 1 else len(scenes) * self.block
 
     @property
+    def drawn_count(self) -> int:
+        """Among how many episodes a seed draws: all of a file; of generated ones those of a usual run, as each may
+        depend on all before it.
+        """
+        count = super().drawn_count
+        return count if self.episode_file else min(count, super().default_episodes)
+
+    @property
     def block(self) -> int:
         """Episodes generated in a scene at a time."""
         return self.per_scene
@@ -202,19 +217,24 @@ class NavigationTask(NavigationSpec, Task):
             ArgumentError: the scenes give fewer.
         """
         scenes = resolve(self.scenes)
-        whole_scene = len(scenes) == 1
+        if len(scenes) > 1 and count > len(scenes) * self.block:
+            raise ArgumentError(
+                f"{self.name}: {count} episodes were requested, but there are only {len(scenes) * self.block}; name "
+                "more scenes (apartments:SPLIT:N) or increase per_scene"
+            )
         made = list(self._episodes)
         while len(made) < count:
-            done = len(made) // self.block
-            if not whole_scene and done >= len(scenes):
-                raise ArgumentError(
-                    f"{self.name}: {count} episodes were requested, but there are only {len(made)}; name more scenes "
-                    "(apartments:SPLIT:N) or increase per_scene"
-                )
-            place = world(scenes[0] if whole_scene else scenes[done], self.backend)
-            block = self.generate_episodes(place, self.block * done if whole_scene else 0, made)
-            made += [replace(episode, episode_id=f"{len(made) + i:04d}") for i, episode in enumerate(block)]
+            made += self.generate_block(scenes, len(made) // self.block, made)
         return made
+
+    def generate_block(self, scenes: Sequence[str], number: int, before: list[Episode]) -> list[Episode]:
+        """Return a block of generated episodes, by its number, after those `before`: of a scene of its own where there
+        are several.
+        """
+        alone = len(scenes) == 1
+        place = world(scenes[0] if alone else scenes[number], self.backend)
+        made = self.generate_episodes(place, self.block * number if alone else 0, before)
+        return [replace(each, episode_id=f"{self.block * number + i:04d}") for i, each in enumerate(made)]
 
     def _first_of_file(self, count: int) -> list[Episode]:
         found = self._read_file()

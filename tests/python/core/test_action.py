@@ -252,6 +252,8 @@ def test_numbers_off_the_grid_are_clamped_or_wrapped() -> None:
         lambda: GRID.decode([0.5] * 7),
         lambda: GRID.decode(3),
         lambda: action.PoseGrid(low=(0, 0, 0), high=(1, 0, 1)),
+        lambda: action.PoseGrid(low=(0, 0)),
+        lambda: action.PoseGrid(low=(0, 0), high=(1, 1)),
     ],
 )
 def test_what_the_grid_cannot_take_is_named(call) -> None:

@@ -68,6 +68,9 @@ def test_starting_at_the_goal_and_goals_out_of_reach():
         metrics.spl([True], [np.inf], [3])
     with pytest.raises(ArgumentError, match="none"):
         metrics.success_rate([])
+    for success in ([80.0], [True, -0.1], [np.nan]):
+        with pytest.raises(ArgumentError, match="numbers from 0 to 1, not percent"):
+            metrics.success_rate(success)
     with pytest.raises(ArgumentError, match="one success"):
         metrics.spl([True], [1, 2], [1, 2])
     with pytest.raises(ArgumentError, match="finite"):

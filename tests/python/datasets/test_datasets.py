@@ -36,7 +36,7 @@ points = st.tuples(finite, finite, finite)
             finite,
             points,
             finite,
-            finite,
+            st.floats(0, 1e3),
             st.dictionaries(st.text(max_size=5), st.integers()),
         ),
         max_size=4,
@@ -74,7 +74,7 @@ def test_the_wrong_quaternion_order_is_noticed() -> None:
         yaw_of([0.9238795, 0.0, 0.3826834, 0.0], "xyzw", "t")
 
 
-def habitat_file(path: Path, scene: str) -> Path:
+def habitat_file(path: Path, scene: str, **more: Any) -> Path:
     episode = {
         "episode_id": "7",
         "scene_id": scene,
@@ -82,6 +82,7 @@ def habitat_file(path: Path, scene: str) -> Path:
         "start_rotation": [0, 0.0, 0, 1.0],
         "info": {"geodesic_distance": 5.5},
         "goals": [{"position": [3.0, 0.05, 1.0], "radius": None}],
+        **more,
     }
     path.write_bytes(gzip.compress(json.dumps({"episodes": [episode]}).encode()))
     return path
@@ -95,6 +96,48 @@ def test_habitat_episodes_run(two_rooms: str, tmp_path: Path) -> None:
     env = task.environment()
     env.begin(episode)
     assert env.goal.image.std() > 1 and env.result()["shortest"] > 5
+
+
+@pytest.mark.parametrize("info", [None, {}, {"geodesic_distance": None}])
+def test_habitat_may_leave_the_length_out(tmp_path: Path, info: Any) -> None:
+    path = habitat_file(tmp_path / "val.json.gz", "a.glb", info=info)
+    assert np.isnan(files.load(path, "/s")[0].geodesic)
+
+
+@pytest.mark.parametrize("metres", [-1.0, "far", True])
+def test_a_length_is_a_number_of_at_least_0(tmp_path: Path, metres: Any) -> None:
+    path = habitat_file(tmp_path / "val.json.gz", "a.glb", info={"geodesic_distance": metres})
+    with pytest.raises(FileError, match=r"episode 0.*info\.geodesic_distance: expected a"):
+        files.load(path, "/s")
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        ({"geodesic": -5.0}, "geodesic: expected a number of at least 0, got -5.0"),
+        ({"info": {"radius": -1}}, r"info\.radius: expected a number above 0, got -1"),
+        ({"info": {"radius": 0}}, r"info\.radius: expected a number above 0, got 0"),
+        ({"info": {"goal_image": 5}}, r"info\.goal_image: expected text, got 5"),
+    ],
+)
+def test_numbers_that_no_episode_can_have_are_named(tmp_path: Path, change: Any, message: str) -> None:
+    path = tmp_path / "e.json"
+    place = (0.0, 0.0, 0.0)
+    files.save(path, [Episode("0", "apartments:val/0", place, 0.0, place, 0.0, 1.0)], "imagenav")
+    body = json.loads(path.read_text())
+    body["episodes"][0] |= change
+    path.write_text(json.dumps(body))
+    with pytest.raises(FileError, match=f"episode 0: {message}"):
+        files.load(path)
+
+
+@pytest.mark.parametrize("info", [{"target": 3, "category": "bed"}, {"question": {"text": "What is this?"}}])
+def test_episodes_of_another_task_are_no_image_goals(tmp_path: Path, info: Any) -> None:
+    path = tmp_path / "e.json"
+    place = (0.0, 0.0, 0.0)
+    files.save(path, [Episode("0", "apartments:val/0", place, 0.0, place, 0.0, 1.0, info)], "ar")
+    with pytest.raises(FileError, match=f"e.json: episode 0 has a {next(iter(info))}, so it is one of another task"):
+        ImageNav(episode_file=path).episodes(1)
 
 
 def object_goal_file(path: Path, scene: str) -> Path:

@@ -279,6 +279,73 @@ def test_episodes_are_counted_round(two_rooms: str, tmp_path: Path) -> None:
         env.reset(options={"episode": -1})
 
 
+@pytest.mark.parametrize("number", ["three", 2.7, True, [1], -1])
+def test_an_episode_is_named_by_a_whole_number(env, number) -> None:
+    with pytest.raises(ArgumentError, match="a whole number of at least 0, got"):
+        env.reset(options={"episode": number})
+
+
+@pytest.mark.parametrize("use", [lambda env: env.step(FORWARD), lambda env: env.run([FORWARD])])
+def test_nothing_happens_after_the_end(env, use) -> None:
+    env.reset(options={"episode": 0})
+    env.step(STOP)
+    ended = env.result()
+    with pytest.raises(ArgumentError, match=r"the episode has ended; call reset\(\)"):
+        use(env)
+    assert env.result() == ended and env.state.ended
+    env.begin(env.task.episode(0))
+    for _ in range(env.task.decisions):
+        assert not env.run([TURN_LEFT]).terminated
+    with pytest.raises(ArgumentError, match="ended"):
+        use(env)
+    assert env.state.decisions == env.task.decisions
+
+
+@pytest.mark.parametrize("plan", [[FORWARD, 0], [FORWARD, 9], [1.7], [[1, 2], [1, 2]], ["forward"]])
+def test_a_plan_of_something_else_moves_and_counts_nothing(env, plan) -> None:
+    env.reset(options={"episode": 0})
+    with pytest.raises(ArgumentError, match=r"expected primitives \[K\] from 1 to 4"):
+        env.run(plan)
+    assert env.result()["actions"] == 0 and env.state.decisions == 0
+
+
+def test_any_episode_of_many_scenes_is_had_without_those_before(tmp_path: Path, two_rooms: str, monkeypatch) -> None:
+    """A seed may draw the last of a thousand scenes: none but that one is opened."""
+    scenes = [str(tmp_path / f"{number}{Path(two_rooms).suffix}") for number in range(1000)]
+    for scene in scenes:
+        Path(scene).symlink_to(two_rooms)
+    monkeypatch.setattr(wiw.tasks.navigation, "resolve", lambda spec: scenes)
+    monkeypatch.setattr(wiw.tasks.imagenav, "resolve", lambda spec: scenes)
+    opened: list[str] = []
+    world = wiw.tasks.navigation.world
+    monkeypatch.setattr(wiw.tasks.navigation, "world", lambda scene, *rest: opened.append(scene) or world(scene, *rest))
+    task, other = ImageNav(scenes=two_rooms, per_scene=2), ImageNav(scenes=two_rooms, per_scene=2)
+    last = task.episode(1999)
+    assert last.scene == scenes[-1] and last.episode_id == "1999" and opened == scenes[-1:]
+    assert task.drawn_count == 2000
+    opened.clear()
+    assert task.episode(3) == other.episodes(4)[3] and set(opened) == set(scenes[:2])
+    with pytest.raises(ArgumentError, match="2001 episodes were requested, but there are only 2000"):
+        task.episode(2000)
+    with pytest.raises(ArgumentError, match="there are only 2000"):
+        other.episodes(5000)
+    assert set(opened) == set(scenes[:2])  # refused before any is made
+
+
+def test_a_seed_draws_few_of_the_episodes_that_depend_on_those_before(two_rooms: str) -> None:
+    assert wiw.make("AR-v0", scenes="apartments:val").task.drawn_count == 20
+    assert wiw.make("ImageNav-v0", scenes=two_rooms).task.drawn_count == 64
+
+
+def test_a_class_that_makes_its_own_episodes_is_asked_for_them(two_rooms: str) -> None:
+    class Turned(ImageNav):
+        def generate_episodes(self, place, first, before):
+            made = super().generate_episodes(place, first, before)
+            return [dataclasses.replace(each, start_yaw=float(len(before))) for each in made]
+
+    assert Turned(scenes=two_rooms, per_scene=1).episode(2).start_yaw == 2
+
+
 def test_the_number_of_decisions_does_not_shrink_with_a_longer_horizon(two_rooms: str) -> None:
     task = ImageNav(scenes=two_rooms, decisions=4)
     env = task.environment()

@@ -197,6 +197,19 @@ def test_plans_are_finite_or_refused(plan: list[list[float]]) -> None:
             check_poses(plan)
 
 
+def test_nothing_moves_after_the_end() -> None:
+    env = made(actions=1)
+    env.reset(options={"episode": 0})
+    assert env.step(POSE)[3]
+    ended, pose = env.result(), env.table.bench.pose
+    with pytest.raises(ArgumentError, match=r"the episode has ended; call reset\(\)"):
+        env.step(make_action(0.1, 0.1, 0.3, 0.0))
+    np.testing.assert_array_equal(env.table.bench.pose, pose)
+    assert env.result() == ended
+    env.reset()
+    assert env.step(POSE)[3]
+
+
 def test_refused_ways_leave_a_valid_state() -> None:
     """Out of reach and into the table: the arm stays within its limits, things stay, and all goes on as if unasked."""
     env = made(tasks="push_buttons")
@@ -283,6 +296,9 @@ def test_bad_actions_move_no_table() -> None:
     many.step(np.full((2, 7), np.nan))  # ignored: both begin anew
     with pytest.raises(ArgumentError, match="2 episodes, got 1"):
         many.reset(options={"episode": [0]})
+    for episodes, said in ((1, "a list of 2 episodes"), ([0, "1"], "whole number of at least 0, got '1'")):
+        with pytest.raises(ArgumentError, match=said):
+            many.reset(options={"episode": episodes})
     with pytest.raises(ArgumentError, match="at least 1"):
         vector(0)
     many.close()

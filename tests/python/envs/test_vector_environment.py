@@ -1,13 +1,17 @@
 # SPDX-License-Identifier: Apache-2.0
 from __future__ import annotations
 
+from pathlib import Path
+
 import numpy as np
 import pytest
 from gymnasium.vector import AutoresetMode
 
 import wiw
 from wiw.action import FORWARD, STOP, TURN_LEFT, TURN_RIGHT
+from wiw.datasets import episodes as episode_files
 from wiw.errors import ArgumentError
+from wiw.tasks.imagenav import ImageNav
 from wiw.types import Episode, Key
 
 PLACES = 3
@@ -94,6 +98,26 @@ def test_episodes_can_be_named_or_drawn(two_rooms: str) -> None:
     assert drawn[0] == drawn[1] != drawn[2]
 
 
+def test_after_the_last_episode_the_next_is_one_that_nobody_has_begun(two_rooms: str, tmp_path: Path) -> None:
+    file = tmp_path / "four.json"
+    episode_files.save(file, ImageNav(scenes=two_rooms, seed=3).episodes(4), "imagenav")
+    vector = wiw.make_vec("ImageNav-v0", PLACES, depth=False, episode_file=file)
+    _, infos = vector.reset(options={"episode": [3, 4, 5]})
+    assert [key.episode for key in infos["key"]] == [3, 0, 1]
+    vector.step([int(STOP), int(TURN_LEFT), int(TURN_LEFT)])
+    *_, infos = vector.step([int(TURN_LEFT)] * PLACES)
+    assert infos["key"][0].episode == 2
+
+
+def test_what_has_been_in_sight_is_that_of_every_place(two_rooms: str) -> None:
+    vector, alone = make(two_rooms, places=2, depth=False), make(two_rooms).task.environment()
+    vector.reset(), alone.reset(options={"episode": 1})
+    for actions in ([FORWARD, TURN_LEFT], [TURN_RIGHT, FORWARD]):
+        vector.step(np.array(actions, int))
+        alone.step(int(actions[1]))
+    assert vector._states[1].observed == alone.state.observed == [0, 1, 2]
+
+
 def test_no_privileged_truth_in_observations_and_infos(two_rooms: str) -> None:
     """Other starts and goals must not change a bit of what is handed out, but for the pixels."""
     seen = []
@@ -131,6 +155,11 @@ def test_wrong_use_says_what_was_expected(two_rooms: str) -> None:
             vector.step(actions)
     with pytest.raises(ArgumentError, match="expected 3 episodes, got 1"):
         vector.reset(options={"episode": [1]})
+    for episodes in (3, [[1, 2, 3]], "abc"):
+        with pytest.raises(ArgumentError, match="expected a list of 3 episodes, one for each place"):
+            vector.reset(options={"episode": episodes})
+    with pytest.raises(ArgumentError, match=r"whole number of at least 0, got 1\.5"):
+        vector.reset(options={"episode": [0, 1, 1.5]})
     with pytest.raises(ArgumentError, match="num_envs"):
         make(two_rooms, places=0)
 

@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 
 import wiw
 from wiw.action import FORWARD, TURN_LEFT, TURN_RIGHT
+from wiw.errors import ArgumentError
 from wiw.policies.base import Situation
 from wiw.policies.heuristic import INVERSE
 from wiw.policies.matcher.exploration import CELL, FAR_DISTANCE, ExplorationMap, to_cells
@@ -184,6 +185,12 @@ def test_a_refused_step_makes_what_is_ahead_solid() -> None:
     assert exploration.look_ahead(np.zeros(3), 1, 1.0)[0][0] == 1.0
     exploration.mark_blocked(np.zeros(3))
     assert exploration.look_ahead(np.zeros(3), 1, 1.0)[0][0] < 3 * CELL
+
+
+@pytest.mark.parametrize("name", ["matcher", "climber", "geometric"])
+def test_a_goal_without_an_image_is_refused(name: str) -> None:
+    with pytest.raises(ArgumentError, match=f"policy {name}: expected a goal image, got none in task ar"):
+        wiw.policy(name).begin(Goal("ar", choices=("bed", "chair")), Key(0, 0))
 
 
 def test_the_matcher_without_imagination_ignores_the_world_models_weight() -> None:

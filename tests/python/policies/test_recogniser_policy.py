@@ -20,6 +20,7 @@ from wiw.action import FORWARD, TURN_LEFT, TURN_RIGHT
 from wiw.datasets.cameras import camera_pose
 from wiw.datasets.visibility import visible_fraction
 from wiw.datasets.worlds import world
+from wiw.errors import ArgumentError
 from wiw.loop.scheduler import run_episodes
 from wiw.policies.recogniser import steering
 from wiw.tasks.ar import AR
@@ -197,6 +198,12 @@ def test_turns_and_the_order_of_steering_cost_a_plan(two_rooms: str, tmp_path: P
     (scores,) = answerer.score([situation], [plans], [futures])
     assert scores[0] - scores[1] == pytest.approx(0.2)
     assert scores[1] - scores[2] == pytest.approx(0.05)
+
+
+@pytest.mark.parametrize("options", [{"views": 0}, {"remember": 0}, {"views": -1}])
+def test_no_glimpses_are_not_all_glimpses(options: dict[str, int]) -> None:
+    with pytest.raises(ArgumentError, match="expected remember and views of at least 1"):
+        wiw.policy("recogniser", **options)
 
 
 def test_weights_that_come_with_the_package_are_small_and_calibrated() -> None:

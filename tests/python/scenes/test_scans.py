@@ -5,6 +5,7 @@ from __future__ import annotations
 
 import gzip
 import json
+import os
 import random
 from collections.abc import Callable
 from functools import partial
@@ -325,6 +326,22 @@ def test_without_the_decoder_a_scan_is_refused(tmp_path: Path, monkeypatch: pyte
     monkeypatch.setattr(basis, "has_decoder", lambda: False)
     with pytest.raises(DependencyError, match=r"pip install 'wiw\[hm3d\]'"):
         load(path)
+
+
+@needs_decoder
+def test_a_scene_that_was_read_without_the_decoder_is_read_again_with_it(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setenv("WIW_CACHE", str(tmp_path / "cache"))
+    path = tmp_path / "a.glb"
+    path.write_bytes(files.basis_glb([(files.DATA / "wall_etc1s.basis").read_bytes()]).bytes())
+    os.utime(path, (1, 1))  # long ago, so that what is read is kept
+    with monkeypatch.context() as patch:
+        patch.setattr(basis, "has_decoder", lambda: False)
+        grey = scenes.load(path, isolate=False)
+    assert grey.missing_texture_share == 1 and "wiw[hm3d]" in grey.warnings[0]
+    found = scenes.load(path, isolate=False)
+    assert found.missing_texture_share == 0 and not found.warnings
 
 
 class TestReplica:

@@ -64,7 +64,7 @@ def test_the_target_is_what_the_renderer_says(file: Path, two_rooms: str) -> Non
 
 
 def test_the_box_follows_a_turn_and_goes_across_the_seam(file: Path) -> None:
-    env = wiw.make("AR-v0", episode_file=file)
+    env = wiw.make("AR-v0", episode_file=file, decisions=16)
     env.reset(options={"episode": 0})
     masks, boxes = [env.observation.target.mask], []
     for _ in range(16):

@@ -167,6 +167,9 @@ def test_a_seed_is_a_whole_number(seed: float) -> None:
 
 def test_an_episode_has_a_number() -> None:
     with pytest.raises(ArgumentError, match="episode: expected a number of 0 or more"):
-        Manipulation().environment().reset(options={"episode": -1})
+        Manipulation().episode(-1)
+    for number in (-1, 0.5, "1", True, [1]):
+        with pytest.raises(ArgumentError, match="reset: expected an episode number, a whole number of at least 0"):
+            Manipulation().environment().reset(options={"episode": number})
     with pytest.raises(ArgumentError, match="robot_tcp"):
         Manipulation(robot_tcp="tip")

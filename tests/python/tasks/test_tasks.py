@@ -223,6 +223,23 @@ def test_a_scene_where_nothing_fits_says_which_rule_is_broken(two_rooms: str) ->
         ImageNav(scenes=two_rooms, longest=2.1, attempts=20).episodes(1)
 
 
+@pytest.mark.parametrize(
+    ("task", "option", "value"),
+    [
+        ("imagenav", "per_scene", 0),
+        ("imagenav", "per_scene", 1.5),
+        ("ar", "per_scene", -1),
+        ("imagenav", "attempts", 0),
+        ("ar", "survey", 0),
+        ("ar", "places", 0),
+        ("ar", "attempts", -2),
+    ],
+)
+def test_numbers_that_leave_no_episode_are_refused(task: str, option: str, value: Any, two_rooms: str) -> None:
+    with pytest.raises(ArgumentError, match=rf"{task}: {option}: expected a?.*at least 1, got {value}"):
+        TASKS.make(task, scenes=two_rooms, **{option: value})
+
+
 def test_a_file_of_episodes_is_run_whole_unless_asked_otherwise(two_rooms: str, tmp_path: Path) -> None:
     path = tmp_path / "two.json"
     assert main(["episodes", "imagenav", "--scenes", two_rooms, "--episodes", "2", "--out", str(path)]) == 0

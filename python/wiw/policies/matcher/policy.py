@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 
 from wiw import panorama
 from wiw.action import FORWARD, TURN_LEFT, TURN_RIGHT, to_trajectory
+from wiw.errors import ArgumentError
 from wiw.policies.base import FrameSpec, Policy, Situation
 from wiw.policies.matcher import appearance
 from wiw.policies.matcher.exploration import ExplorationMap
@@ -102,9 +103,12 @@ class Matcher(Policy):
         return {"policy": type(self).__name__, **asdict(self.options)}
 
     def begin(self, goal: Goal, key: Key) -> Memory:
-        """Extract features of the goal image; start with an empty map."""
-        assert goal.image is not None
-        return Memory(appearance.build_goal_template(goal.image))
+        """Extract features of the goal image; start with an empty map.
+
+        Raises:
+            ArgumentError: the goal has no image.
+        """
+        return Memory(appearance.build_goal_template(self._require_goal_image(goal)))
 
     def observe(self, situations: Sequence[Situation]) -> None:
         """Extend each map, and measure the similarity of the present place to the goal."""
@@ -158,6 +162,14 @@ class Matcher(Policy):
         """Return the best plan; remember it, to notice whether it moves the agent."""
         situation.memory.last_plan, chosen = super().revise(situation, proposals, scores)
         return situation.memory.last_plan, chosen
+
+    def _require_goal_image(self, goal: Goal) -> NDArray[np.uint8]:
+        if goal.image is None:
+            name = type(self).__name__.lower()
+            raise ArgumentError(
+                f"policy {name}: expected a goal image, got none in task {goal.task}; use it with task imagenav"
+            )
+        return goal.image
 
     def _measure_place(self, memory: Memory, band: appearance.Band) -> NDArray[np.float32]:
         """Measure a place against the goal; return the similarity of each column's view, float32 [128]."""

@@ -60,7 +60,8 @@ class Recognition(Policy):
         trust: deduction for each rank in the order of proposals, which is all that counts without a world model.
 
     Raises:
-        BackendError: torch is not installed.
+        ArgumentError: no glimpses to remember or to view.
+        DependencyError: torch or safetensors is not installed.
         FileError: the weights cannot be read.
     """
 
@@ -90,6 +91,10 @@ class Recognition(Policy):
         turning: float = 0.05,
         trust: float = 0.3,
     ) -> None:
+        if min(remember, views) < 1:
+            raise ArgumentError(
+                f"policy recogniser: expected remember and views of at least 1, got {remember} and {views}"
+            )
         self.file = Path(WEIGHTS if weights is None else weights)
         self.recogniser = Recogniser.load(self.file)
         self.tracker = TRACKERS.make(tracker, **(tracker_options or {}))

@@ -46,14 +46,16 @@ def read_scene(file: Path, options: dict[str, Any]) -> Imported:
 
     Args:
         file: a mesh, a Gazebo world, or what a scan is opened by.
-        options: those of `wiw.scenes.load`, and as "scan" what `find_reader` returned.
+        options: those of `wiw.scenes.load`, as "scan" what `find_reader` returned, and "basis_decoder", which only
+            names the scene in the cache.
 
     Raises:
         FileError: a file is missing, damaged or does not fit the others; names it.
         ArgumentError: an option is out of its range.
         DependencyError: textures need a decoder that is not installed.
     """
-    reader, options = options.get("scan"), {name: value for name, value in options.items() if name != "scan"}
+    reader = options.get("scan")
+    options = {name: value for name, value in options.items() if name not in ("scan", "basis_decoder")}
     if reader is not None:
         return _READERS[reader[0]](file, options)
     return Imported(*import_mesh(file, **options))
