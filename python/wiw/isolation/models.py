@@ -18,9 +18,9 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from wiw.errors import ArgumentError, RegistryError
+from wiw.errors import ArgumentError, ConstructionError, RegistryError
 from wiw.isolation.child import Host
-from wiw.isolation.failures import ExitError, RaisedError
+from wiw.isolation.failures import EndedError, ExitError, LateError, RaisedError
 from wiw.isolation.source import Isolated, Source, build_signature, describe_class, read_file_state
 from wiw.json_text import parse_json
 from wiw.registry import WORLD_MODELS
@@ -38,6 +38,8 @@ from wiw.world_models.remote.declaration import declaration, parse_declaration
 
 DOOR = {"isolate": (True, "bool"), "memory_gb": (None, "float | None")}
 """Options of every model of one's own, which its constructor does not see."""
+IDENTIFYING = 600.0
+"""Least seconds in which a model has to say what it is: a fingerprint may read all of its weights."""
 RESTARTS = 2
 """Calls in a row that raise, after which the process is started anew."""
 
@@ -124,16 +126,28 @@ class IsolatedModel(Isolated, WorldModel):
 
     def describe(self) -> dict[str, Any]:
         """Return what the model says of itself."""
-        described: dict[str, Any] = parse_json(self.ask(describe_model))
+        described: dict[str, Any] = parse_json(self._ask_for_identity(describe_model))
         return described
 
     def fingerprint(self) -> str:
         """Return the model's own."""
-        return str(self.ask(fingerprint_model))
+        return self._ask_for_identity(fingerprint_model)
 
-    def ask(self, function: Callable[..., Any], *arguments: Any) -> Any:
+    def ask(self, function: Callable[..., Any], *arguments: Any, seconds: float = math.inf) -> Any:
         """Call a function on the model in its process; see `ChildProcess.call`."""
-        return self._find_process().call(function, *arguments)[0]
+        return self._find_process().call(function, *arguments, seconds=seconds)[0]
+
+    def _ask_for_identity(self, function: Callable[[Host], str]) -> str:
+        """Return what the model says of itself.
+
+        Raises:
+            ConstructionError: it did not answer in time, or ended its process.
+        """
+        try:
+            return str(self.ask(function, seconds=max(self._patience, IDENTIFYING)))
+        except (LateError, EndedError, ExitError) as error:
+            text = f"world model '{self.source.name}' cannot say what it is: {error}"
+            raise ConstructionError(text, error.kind) from None
 
     def rollout(
         self, observations: Conditioning, controls: Sequence[Control], seeds: NDArray[np.uint64]

@@ -10,6 +10,7 @@ import itertools
 import json
 import weakref
 from collections.abc import Mapping, Sequence
+from copy import deepcopy
 from dataclasses import asdict, replace
 from functools import lru_cache, partial
 from typing import Any
@@ -57,10 +58,13 @@ def _make_class(name: str, state: tuple[str, int, int] | None) -> type[IsolatedP
 
 
 class _MemoryHandle:
-    """Handle of an episode's memory, which stays in the policy's process."""
+    """Handle of an episode's memory, which stays in the policy's process; a deep copy is one of a copy of it there."""
 
-    def __init__(self, number: int) -> None:
-        self.number = number
+    def __init__(self, policy: IsolatedPolicy, number: int) -> None:
+        self.number, self._policy = number, policy
+
+    def __deepcopy__(self, memo: dict[int, Any]) -> _MemoryHandle:
+        return self._policy._copy_memory(self)
 
 
 class IsolatedPolicy(Isolated, Policy):
@@ -106,9 +110,8 @@ class IsolatedPolicy(Isolated, Policy):
 
     def begin(self, goal: Goal, key: Key) -> Any:
         """Begin an episode there; return a handle of its memory."""
-        handle = _MemoryHandle(next(self._numbers))
+        handle = self._make_handle()
         self._call(begin_episode, handle.number, goal, key)
-        weakref.finalize(handle, self._forgotten.append, handle.number).atexit = False
         return handle
 
     def observe(self, situations: Sequence[Situation]) -> None:
@@ -165,6 +168,17 @@ class IsolatedPolicy(Isolated, Policy):
         return tuple(
             Exchange(**{**each, "said": tuple(each["said"])}) for each in json.loads(self._call(list_exchanges, key))
         )
+
+    def _make_handle(self) -> _MemoryHandle:
+        handle = _MemoryHandle(self, next(self._numbers))
+        weakref.finalize(handle, self._forgotten.append, handle.number).atexit = False
+        return handle
+
+    def _copy_memory(self, handle: _MemoryHandle) -> _MemoryHandle:
+        """Return the handle of a copy: what is scored to measure fidelity must leave no trace in an episode's own."""
+        copy = self._make_handle()
+        self._call(copy_memory, handle.number, copy.number)
+        return copy
 
     def _begin(self) -> None:
         """Make the policy in a process that has none."""
@@ -272,6 +286,12 @@ def begin_episode(host: Host, number: int, goal: Goal, key: Key) -> None:
     host.memories[number] = host.made.begin(goal, key)
 
 
+def copy_memory(host: Host, number: int, copy: int) -> None:
+    """Copy the memory of an episode under another number."""
+    _require_memories(host, [number])
+    host.memories[copy] = deepcopy(host.memories[number])
+
+
 def observe(host: Host, situations: Sequence[Situation]) -> None:
     """Let the policy update its memories."""
     host.made.observe(_show_memories(host, situations))
@@ -315,10 +335,13 @@ def list_exchanges(host: Host, key: Key) -> str:
 
 
 def _show_memories(host: Host, situations: Sequence[Situation]) -> list[Situation]:
-    missing = [each.memory for each in situations if each.memory not in host.memories]
-    if missing:
-        raise RuntimeError("the policy's process has ended, and its memory of this episode is lost")
+    _require_memories(host, [each.memory for each in situations])
     return [replace(each, memory=host.memories[each.memory]) for each in situations]
+
+
+def _require_memories(host: Host, numbers: Sequence[int]) -> None:
+    if any(number not in host.memories for number in numbers):
+        raise RuntimeError("the policy's process has ended, and its memory of this episode is lost")
 
 
 def _pack_plans(plans: Any) -> Any:

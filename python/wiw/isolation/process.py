@@ -66,7 +66,7 @@ class ChildProcess:
     @property
     def alive(self) -> bool:
         """Whether the process is there."""
-        return self._process is not None and self._process.poll() is None
+        return self._process is not None and not _has_ended(self._process)
 
     def call(
         self, function: Callable[..., Any], *arguments: Any, seconds: float = math.inf, answer: int = 0
@@ -90,8 +90,10 @@ class ChildProcess:
             RaisedError: the code raised an exception; one of wiw's own is raised as it is.
         """
         with self._lock:
-            if not self.alive:
+            if self._process is None:
                 self._start()
+            elif not self.alive:  # just now: another process would not have what was made in this one
+                raise EndedError(self._describe_end())
             try:
                 message, segments, memory = self._pack(function, arguments, answer)
                 until = None if math.isinf(seconds) else time.monotonic() + seconds
@@ -213,17 +215,26 @@ class ChildProcess:
         """Return how the process has ended, in words; end it where it has only closed its connection."""
         process = self._process
         assert process is not None
-        try:
-            code = process.wait(1.0)
-        except subprocess.TimeoutExpired:
-            code = None
+        give_up = time.monotonic() + 1.0
+        while not (ended := _has_ended(process)) and time.monotonic() < give_up:
+            time.sleep(0.01)
         self.kill()
-        if code is None:
+        code = process.returncode
+        if not ended:
             return "its process closed its connection, or sent something that is not a reply"
         if code >= 0:
             return f"its process ended with exit code {code}"
         name = signal.Signals(-code).name
         return f"its process ended with {name}" + (", perhaps out of memory" if name == "SIGKILL" else "")
+
+
+def _has_ended(process: subprocess.Popen[bytes]) -> bool:
+    """Return whether a process has ended, and leave its exit code: until that is taken its group can be killed."""
+    try:
+        flags = os.WEXITED | os.WNOWAIT | os.WNOHANG
+        return process.returncode is not None or os.waitid(os.P_PID, process.pid, flags) is not None
+    except ChildProcessError:
+        return True
 
 
 def _read_own_memory(process: int) -> int:

@@ -4,6 +4,7 @@
 from __future__ import annotations
 
 import inspect
+import math
 import weakref
 from collections import Counter
 from collections.abc import Callable, Mapping, Sequence
@@ -14,7 +15,7 @@ from typing import Any, ClassVar
 from wiw.errors import ConstructionError, InfrastructureError, RegistryError
 from wiw.isolation.child import Host
 from wiw.isolation.failures import EndedError, ExitError, LateError
-from wiw.isolation.process import ChildProcess
+from wiw.isolation.process import STARTING, ChildProcess
 
 _SOURCES: weakref.WeakSet[Source] = weakref.WeakSet()
 
@@ -37,7 +38,7 @@ class Source:
     def __init__(self, kind: str, name: str, load: Callable[[Host, str], dict[str, Any]]) -> None:
         self.kind, self.name, self._load = kind, name, load
         self._idle: ChildProcess | None = None
-        self.description = self._import(process := ChildProcess())
+        self.description = self._import(process := ChildProcess(), math.inf)
         self._idle = process
         _SOURCES.add(self)
 
@@ -50,35 +51,42 @@ class Source:
         """Call a function on the imported class; see `ChildProcess.call`."""
         if self._idle is None or not self._idle.alive:
             self._idle = ChildProcess()
-            self.load(self._idle)
+            self._load_again(self._idle, math.inf)
         return self._idle.call(function, *arguments)[0]
 
-    def take_process(self, memory_gb: float | None) -> ChildProcess:
-        """Return a process that has imported the code; nobody else has it."""
+    def take_process(self, memory_gb: float | None, seconds: float = math.inf) -> ChildProcess:
+        """Return a process that has imported the code, within so many seconds and no fewer than `STARTING`.
+
+        Nobody else has it.
+
+        Raises:
+            RegistryError: it cannot be imported, or not in time.
+            InfrastructureError: it has changed since it was first imported.
+        """
         if memory_gb is None and self._idle is not None and self._idle.alive:
             process, self._idle = self._idle, None
             return process
         process = ChildProcess(memory_gb)
-        self.load(process)
+        self._load_again(process, max(seconds, STARTING))
         return process
 
-    def load(self, process: ChildProcess) -> None:
-        """Import the code in a process.
+    def _load_again(self, process: ChildProcess, seconds: float) -> None:
+        """Import the code in another process.
 
         Raises:
             RegistryError: it cannot be imported.
             InfrastructureError: it has changed since it was first imported.
         """
-        found = self._import(process)
+        found = self._import(process, seconds)
         names = ("module", "name")  # a module's has the state of its file
         if any(found[name] != self.description[name] for name in names):
             raise InfrastructureError(f"{self.kind} '{self.name}' has changed since it was loaded; start a new run")
 
-    def _import(self, process: ChildProcess) -> dict[str, Any]:
+    def _import(self, process: ChildProcess, seconds: float) -> dict[str, Any]:
         """Import the code in a process; return what it says of itself."""
         try:
-            description: dict[str, Any] = process.call(self._load, self.name)[0]
-        except (EndedError, ExitError) as error:
+            description: dict[str, Any] = process.call(self._load, self.name, seconds=seconds)[0]
+        except (EndedError, ExitError, LateError) as error:
             raise RegistryError(f"{self.kind} '{self.name}' cannot be loaded: {error}") from None
         return description
 
@@ -136,7 +144,7 @@ class Isolated:
         """
         self._spent_before += self._spent
         self._spent = Counter()
-        process = self.source.take_process(self._memory_gb)
+        process = self.source.take_process(self._memory_gb, seconds)
         cannot = f"{self.source.kind} '{self.source.name}' cannot be built"
         try:
             answer = process.call(function, *arguments, seconds=seconds)[0]

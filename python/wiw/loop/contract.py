@@ -115,6 +115,22 @@ def check_scores(policy: Policy, scores: Any, proposals: Sequence[Sequence[Propo
     return found
 
 
+def check_chosen(policy: Policy, chosen: Any, count: int) -> int | None:
+    """Return the number of the plan that `revise` has chosen among `count` proposals; None for a new plan.
+
+    Raises:
+        ContractError: there is no such proposal, or it is no whole number.
+    """
+    if chosen is None:
+        return None
+    if isinstance(chosen, bool) or not isinstance(chosen, int | np.integer) or not 0 <= chosen < count:
+        raise ContractError(
+            f"{type(policy.unwrapped).__name__}.revise: expected the number of one of {count} proposals, from 0, or "
+            f"None for a new plan, got {chosen!r}"
+        )
+    return int(chosen)
+
+
 def check_answerer(policy: Policy, goal: Goal) -> None:
     """Refuse a reviser that gives no answer where the goal requires one.
 

@@ -12,7 +12,14 @@ import numpy as np
 from numpy.typing import NDArray
 
 from wiw.loop.config import AgentConfig
-from wiw.loop.contract import check_answers, check_observations, check_pictures, check_proposals, check_scores
+from wiw.loop.contract import (
+    check_answers,
+    check_chosen,
+    check_observations,
+    check_pictures,
+    check_proposals,
+    check_scores,
+)
 from wiw.loop.imagination import Imagination, Imaginer, ModelInput, NoImagination, Request
 from wiw.loop.ledger import Ledger
 from wiw.loop.memory import EpisodeMemories, Query
@@ -209,7 +216,7 @@ class DecisionPass:
         reviser, config = self._parts.reviser, self._parts.config
         actions, chosen = reviser.revise(self._revising[episode], plans, scores)
         source = f"{type(reviser.unwrapped).__name__}.revise"
-        return self._parts.space.check_plan(source, actions, config.longest), chosen
+        return self._parts.space.check_plan(source, actions, config.longest), check_chosen(reviser, chosen, len(plans))
 
     def _list_policies(self) -> list[Policy]:
         policy, reviser = self._parts.policy, self._parts.reviser

@@ -73,7 +73,10 @@ class RolloutCache:
                 found = self._read(file, first, frames)
         except (FileNotFoundError, NotADirectoryError):
             return False
-        except (OSError, ValueError) as error:
+        except OSError as error:  # such as no descriptor left: the entry, which may have been paid for, is as it was
+            _log.warning("cached rollout %s cannot be read now (%s); it is imagined again", path, error)
+            return False
+        except ValueError as error:
             _log.warning("cached rollout %s is damaged (%s); it is dropped and imagined again", path, error)
             with suppress(OSError):
                 path.unlink()
@@ -98,17 +101,16 @@ class RolloutCache:
                 file.write(start + struct.pack("<I", zlib.crc32(start)))
                 file.write(data.data)
             draft.replace(path)
-        except OSError as error:
+            self._written += size
+            if self._known is None or self._known + self._written > self.budget or self._written > self.budget // 20:
+                self._trim()
+        except OSError as error:  # also of a file system without locks
             with suppress(OSError):
                 draft.unlink(missing_ok=True)
             self._writing = False
             _log.warning(
                 "rollouts are no longer cached: %s; free some disk space or choose another folder with --cache", error
             )
-            return
-        self._written += size
-        if self._known is None or self._known + self._written > self.budget or self._written > self.budget // 20:
-            self._trim()
 
     def _find_path(self, key: str) -> Path:
         return self.folder / key[:2] / f"{key[2:]}.frames"

@@ -39,7 +39,7 @@ REVISER = "vlm"
 SILENT = ("temperature", "revision_temperature", "tries")
 """Options of it that the paper does not name."""
 SERVED = "they are its server's; whether they are the preset's is unknown"
-UNCOUNTED = (*ELSEWHERE, "model", "prompts", "task", "space")
+UNCOUNTED = (*ELSEWHERE, "key", "model", "prompts", "task", "space")
 """Options of policy `vlm` that are not part of the protocol, or are looked at by themselves."""
 
 

@@ -143,10 +143,10 @@ def run_pending(
     spec = WorkerSpec(task, agents, seed, store.salt, info["live"], pictures, info["limits"], episodes, sources)
     board = make_board(progress and any(pending.values()))
     try:
-        if any(pending.values()):
-            store.begin_session()
         for arm, indices in pending.items():
             store.discard(arm, indices)
+        if any(pending.values()):  # now: errors that are tried again have not ended
+            store.begin_session()
         built = task.build()
         writer = _StoreWriter(store, Tracker(_count_ended(store, pending), built.decisions, board))
         for batch in _split_by_looks(store, episodes, pending, looks, board):

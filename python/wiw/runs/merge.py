@@ -138,7 +138,7 @@ def require_equal_manifests(stores: Sequence[RunStore]) -> None:
 def _read_manifest(store: RunStore) -> dict[str, Any]:
     info = store.info
     episodes = [{**asdict(episode), "geodesic": None} for episode in store.episodes()]  # may be measured in one alone
-    limits = {name: info["limits"].get(name) for name in ("fidelity", "lpips")}
+    limits = {name: info["limits"].get(name) for name in ("fidelity", "fidelity_share", "lpips")}
     kept = {name: info.get(name) for name in ("sources", "scenes")}
     versions = {"wiw": store.wiw_version, "benchmark": store.benchmark}
     return {**versions, **store.config, "salt": store.salt, **limits, **kept, "episode": episodes}

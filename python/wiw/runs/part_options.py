@@ -19,9 +19,9 @@ def parse_options(pairs: Sequence[str], factory: Callable[..., Any], flag: str) 
     """`["steps=30", "size=[480, 480]"]` as options of a factory.
 
     A value is read as YAML (number, true, [list], text); it stays text where the factory's parameter is annotated as
-    such, so that a revision of digits is not a number. The brackets of a list may be left out where it is annotated as
-    a sequence: `categories=bed,coffee table`. Files and folders that exist are named from the root on, so that a run
-    can be resumed from any folder.
+    such, so that a revision of digits is not a number, except for `null` where it may be None. The brackets of a list
+    may be left out where it is annotated as a sequence: `categories=bed,coffee table`. Files and folders that exist are
+    named from the root on, so that a run can be resumed from any folder.
 
     Raises:
         ArgumentError: no `=`, a key given twice, or a value that is no YAML; names the flag.
@@ -44,7 +44,8 @@ def parse_options(pairs: Sequence[str], factory: Callable[..., Any], flag: str) 
         names_files = (name in FILES or re.search(r"\bPath\b", annotation)) and value != default
         path = _make_absolute(value) if names_files else None
         try:
-            options[name] = path or (value if annotation.startswith("str") else yaml.safe_load(value))
+            is_text = annotation.startswith("str") and not (value == "null" and "None" in annotation)
+            options[name] = path or (value if is_text else yaml.safe_load(value))
         except yaml.YAMLError as error:
             raise ArgumentError(f"{flag}: {pair}: the value is not valid YAML ({error})") from None
     return options

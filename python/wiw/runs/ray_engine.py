@@ -48,7 +48,8 @@ from wiw.types import Episode, EpisodeResult
 TRIES = 3
 """How often an episode is started if its actor or server is lost."""
 UNREACHABLE = ("connection", "unreachable")
-"""Kinds of errors that say that a server was lost, of world models and of language models."""
+"""Kinds of errors that say that a server was lost, of world models and of language models; an episode's kind says
+before them whose."""
 TOGETHER = 0.02
 """Seconds that an actor waits for more rows before it sends some."""
 START_SECONDS = 600.0
@@ -87,7 +88,7 @@ class EpisodeActor:
     def _run(self, job: Job, rows: queue.SimpleQueue[Row | Exception | None]) -> None:
         try:
             self._runner.run(job, rows.put)
-        except Exception as error:
+        except BaseException as error:  # SystemExit too: else the job would seem to have ended
             rows.put(make_portable(error))
         finally:
             rows.put(None)
@@ -265,7 +266,8 @@ class _ActorPool:
 
     def _may_try_again(self, job: Job, error: Exception | EpisodeResult) -> bool:
         """Return whether an error is a lost server's, and the job has tries left."""
-        told = isinstance(error, EpisodeResult | RemoteError | VlmError) and error.kind in UNREACHABLE
+        kind = error.kind if isinstance(error, EpisodeResult | RemoteError | VlmError) else ""
+        told = kind.rpartition("/")[2] in UNREACHABLE
         return told and bool(len(self._models) or len(self._vlms)) and job.attempt + 1 < TRIES
 
     def _lease_again(self, lease: _Lease, episodes: Mapping[int, Episode]) -> None:

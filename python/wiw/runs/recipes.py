@@ -182,7 +182,21 @@ class AgentRecipe(AgentConfig):
 
     def to_json(self) -> dict[str, Any] | None:
         """Return the recipe for the run store; `AgentRecipe.from_json` is the way back. None with objects in memory."""
-        return {name: getattr(self, name) for name in _FIELDS} if self.is_named else None
+        own = self.without_secrets()
+        return {name: getattr(own, name) for name in _FIELDS} if self.is_named else None
+
+    def without_secrets(self) -> AgentRecipe:
+        """Return the same agent without servers' keys and tokens: records are shown and passed on."""
+        policies = {
+            name: _leave_out(own, "key") if name == "vlm" or "vlm" in own else own
+            for name, own in self.policy_options.items()
+        }
+        named = self.model if isinstance(self.model, str) else ""
+        is_served = named in WORLD_MODELS.built_in or named.startswith(
+            "remote:"
+        )  # others may mean something else by it
+        options = _leave_out(self.model_options, "token") if is_served else self.model_options
+        return replace(self, policy_options=policies, model_options=options)
 
     @classmethod
     def from_json(cls, data: Mapping[str, Any]) -> AgentRecipe:
@@ -206,11 +220,11 @@ class AgentRecipe(AgentConfig):
                 SEMANTICS.fitting(self.semantics, **self.semantics_options)
             else:
                 SEMANTICS.find(self.semantics)  # some are made of what an environment tells
-        said = {name: _describe(getattr(self, name)) for name in _FIELDS}
-        if self.policy_options:
+        own = self.without_secrets()
+        said = {name: _describe(getattr(own, name)) for name in _FIELDS}
+        if own.policy_options:
             said["policy_options"] = {
-                policy: {name: value for name, value in options.items() if name not in ELSEWHERE}
-                for policy, options in self.policy_options.items()
+                policy: _leave_out(options, *ELSEWHERE) for policy, options in own.policy_options.items()
             }
         return {name: value for name, value in said.items() if value not in (None, {}, [], ())}
 
@@ -253,11 +267,10 @@ class AgentRecipe(AgentConfig):
                 found.require(said)
 
     def replaying(self, run: Path) -> AgentRecipe:
-        """Return the same agent with a run's recorded answers in place of its language model."""
-        replay = {"vlm": f"replay:{run}", "cache": "off"}
+        """Return the same agent with a run's recorded answers in place of its language models."""
         named: dict[str, Mapping[str, Any]] = {name: {} for name in (self.policy, self.reviser) if name == "vlm"}
         options = {
-            policy: {**own, **(replay if policy == "vlm" or "vlm" in own else {})}
+            policy: _replay(own, run) if policy == "vlm" or "vlm" in own else own
             for policy, own in (named | dict(self.policy_options)).items()
         }
         return replace(self, policy_options=options)
@@ -316,6 +329,18 @@ class AgentRecipe(AgentConfig):
 
 
 _FIELDS = tuple(field.name for field in fields(AgentRecipe) if field.name != "observers")
+
+
+def _replay(options: Mapping[str, Any], run: Path) -> dict[str, Any]:
+    """Return a policy's options with a run's recorded answers in place of all models, those of its roles included."""
+    replayed = {**options, "vlm": f"replay:{run}", "cache": "off"}
+    if roles := options.get("roles"):
+        replayed["roles"] = {role: _leave_out(own, "vlm") for role, own in roles.items()}
+    return replayed
+
+
+def _leave_out(options: Mapping[str, Any], *names: str) -> dict[str, Any]:
+    return {name: value for name, value in options.items() if name not in names}
 
 
 def _unwrap(part: Any) -> Any:

@@ -13,7 +13,8 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from wiw.errors import ArgumentError, StoreError
+from wiw.errors import ArgumentError, ContractError, StoreError
+from wiw.runs.shapes import find_misfit
 from wiw.types import Answer, ArmObservation, DecisionRecord, Episode, EpisodeResult, Fidelity, TextAnswer, Truth
 
 STRIP_HEIGHT = 160
@@ -94,7 +95,11 @@ def _make_plain(value: Any) -> Any:
 
 
 def decision_row(arm: str, record: DecisionRecord, with_images: bool) -> DecisionRow:
-    """Return the row of a decision, with pictures only if asked: they are most of the bytes."""
+    """Return the row of a decision, with pictures only if asked: they are most of the bytes.
+
+    Raises:
+        ContractError: the agent has decided something that could not be read again, such as a note that is no text.
+    """
     decision = record.decision
     proposals = [
         {"actions": p.actions, "prior": p.prior, "note": p.note} | ({"text": p.text} if p.text else {})
@@ -123,8 +128,29 @@ def decision_row(arm: str, record: DecisionRecord, with_images: bool) -> Decisio
         **_describe_truth("before", record.before),
         **_describe_truth("after", record.after),
     }
+    _require_readable(arm, record.episode, f", decision {record.index}", values)
     images = dict(_encode_images(record)) if with_images else {}
     return DecisionRow(arm, int(record.episode), int(record.index), values, images)
+
+
+def outcome_row(arm: str, result: EpisodeResult) -> OutcomeRow:
+    """Return the row of an episode's end.
+
+    Raises:
+        ContractError: the environment gives a metric that is no number, or details that are no mapping.
+    """
+    values = {"metrics": to_json(dict(result.metrics)), "details": to_json(dict(result.details))}
+    _require_readable(arm, result.episode, "", values)
+    return OutcomeRow(arm, result)
+
+
+def _require_readable(arm: str, episode: int, place: str, values: Mapping[str, Any]) -> None:
+    """Check that a row can be read again: one that cannot would take all others of the run with it."""
+    if misfit := find_misfit(values):
+        raise ContractError(
+            f"arm {arm}, episode {episode}{place}: cannot be recorded: {misfit}. Correct what the agent or the "
+            "environment returns"
+        )
 
 
 def _answer(answer: Answer | TextAnswer) -> dict[str, Any]:

@@ -102,12 +102,12 @@ def find_local_folder() -> Path:
 
 @contextmanager
 def make_local_folder(parent: str | Path | None) -> Iterator[Path]:
-    """Yield a new folder that is removed at the end, in `parent`, else where temporary files belong.
+    """Yield a new folder that is removed at the end, in `parent`; without one, or "auto", where temporary files belong.
 
     Raises:
         FileError: it cannot be made.
     """
-    own = find_local_folder() if parent is None else Path(parent)
+    own = find_local_folder() if parent is None or str(parent) == "auto" else Path(parent)
     try:
         own.mkdir(parents=True, exist_ok=True)
         folder = tempfile.TemporaryDirectory(prefix="wiw-", dir=own)

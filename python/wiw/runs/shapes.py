@@ -1,5 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The expected shapes of a run store's values, so that a store edited by hand raises an error that names the place."""
+"""The expected shapes of a run store's values, so that a store edited by hand raises an error that names the place, and
+nothing is written that could not be read again.
+"""
 
 from __future__ import annotations
 
@@ -87,14 +89,41 @@ def parse_column(column: str, text: Any, where: str) -> Any:
         StoreError: it is not JSON, or of another shape; names `where`.
     """
     try:
+        return _read_column(column, text)
+    except ValueError as error:
+        raise StoreError(f"{where}: {error}; the run store was edited: restore it from a backup") from error
+
+
+def _read_column(column: str, text: Any) -> Any:
+    """Return the value of a column; raise ValueError where it has not the column's shape."""
+    try:
         if not isinstance(text, str):
             raise ValueError(f"expected text, got {type(text).__name__}")
         value = parse_json(text)
         _check(value, COLUMNS[column], "")
     except ValueError as error:
-        name = column.rpartition(".")[2]
-        raise StoreError(f"{where}: {name}: {error}; the run store was edited: restore it from a backup") from error
+        raise ValueError(f"{column.rpartition('.')[2]}: {error}") from error
     return value
+
+
+def find_misfit(row: Mapping[str, Any]) -> str:
+    """Return why readers would refuse a row that is about to be written, in words; empty if they take it.
+
+    Args:
+        row: columns of a decision or an outcome by name; those of `COLUMNS` hold JSON, or None where that is allowed.
+    """
+    try:
+        read = {
+            name: _read_column(name, value) if name in COLUMNS and value is not None else value
+            for name, value in row.items()
+        }
+        if not isinstance(read.get("note", ""), str):
+            raise ValueError(f"note: expected str, got {type(read['note']).__name__}")
+        if "proposals" in read:
+            _require_agreement(read)
+    except ValueError as error:
+        return str(error)
+    return ""
 
 
 def check_types(row: Mapping[str, Any], declared: Mapping[str, tuple[type, ...]], where: str) -> None:
@@ -117,15 +146,23 @@ def check_decision(row: Mapping[str, Any], where: str) -> None:
     Raises:
         StoreError: they do not fit; names `where`.
     """
+    try:
+        _require_agreement(row)
+    except ValueError as error:
+        raise StoreError(f"{where}: {error}; the run store was edited: restore it from a backup") from error
+
+
+def _require_agreement(row: Mapping[str, Any]) -> None:
+    """Raise ValueError where a decision's columns do not fit together."""
     count = len(row["proposals"])
     fits = all(row[name] is None or len(row[name]) == count for name in ("scores", "real_frames"))
     chosen = row["chosen"] is None or 0 <= row["chosen"] < count
     lengths = {len(own) if isinstance(own, list) else None for own in (*row["actions"], *row["executed"])}
     fits = fits and len(row["actions"]) > 0 and len(lengths) == 1
     if not fits or not chosen or not row["path"] or any(len(place) != 3 for place in row["path"]):
-        raise StoreError(
-            f"{where}: expected actions of one kind, a score and frames for each of {count} proposals, one of them "
-            "chosen, and a path of [x, y, z]; the run store was edited: restore it from a backup"
+        raise ValueError(
+            f"expected actions of one kind, a score and frames for each of {count} proposals, one of them chosen, and "
+            "a path of [x, y, z]"
         )
 
 

@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import json
 import math
+import re
 import sqlite3
 from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager, suppress
@@ -126,6 +127,8 @@ class RunStore:
             connection.execute(f"PRAGMA application_id = {APPLICATION_ID}")
             connection.execute(f"PRAGMA user_version = {SCHEMA_VERSION}")
             recorded = {"benchmark": benchmark.VERSION, **info}
+            if "command" in recorded:
+                recorded["command"] = [_hide_secret(argument) for argument in recorded["command"]]
             connection.execute(
                 "INSERT INTO run VALUES (1, ?, ?, ?, ?)", (created, wiw.__version__, to_json(config), to_json(recorded))
             )
@@ -174,9 +177,8 @@ class RunStore:
         if scratch is not None and path.exists():
             store = cls._open_scratch_copy(ScratchCopy(path, Path(scratch)))
         else:
-            store = cls._open(path, lock_store(path) if path.exists() else None)
+            store = cls._open(path, lock_store(path) if path.exists() else None, continues=True)
         with store._close_on_error():
-            store.require_version()
             if config is not None:
                 wanted = json.loads(to_json(config))
                 configurations.require_same(
@@ -255,16 +257,19 @@ class RunStore:
         except BaseException:
             lock.close()
             raise
-        return cls._open(copy.path, lock, copy)
+        return cls._open(copy.path, lock, copy, continues=True)
 
     @classmethod
-    def _open(cls, path: Path, lock: Any, copy: ScratchCopy | None = None) -> RunStore:
+    def _open(cls, path: Path, lock: Any, copy: ScratchCopy | None = None, continues: bool = False) -> RunStore:
+        """Open a file that exists; `continues` requires that this version may add episodes to it."""
         if not path.is_file():
             raise StoreError(f"no run at {path.parent}: expected a folder with {FILE_NAME} in it")
         store = cls(path, connect(path, lock), lock, copy)
         with store._close_on_error():
             store._require_whole()
             store._require_readable()
+            if continues:  # before the file is touched: the version that may continue it reads its own schema alone
+                store.require_version()
             store._update_schema()
         return store
 
@@ -827,6 +832,15 @@ def leave_resumable(begun: RunStore) -> Iterator[None]:
                 note = f"Everything recorded is kept. Once the cause is fixed:  wiw resume {path.parent}"
                 vars(error).setdefault("__notes__", []).append(note)  # as `add_note` of Python 3.11 does
         raise
+
+
+_SECRET = re.compile(r"(?<![\w-])(key|token)=[^,&\s]+")
+"""An option that is a secret of a server, as in `--policy-option key=...` and `--arms a=remote:...?token=...`."""
+
+
+def _hide_secret(argument: str) -> str:
+    """Return an argument of a command as reports may show it."""
+    return _SECRET.sub(r"\1=***", argument)
 
 
 def _format_now() -> str:

@@ -4,6 +4,7 @@
 from __future__ import annotations
 
 import fcntl
+import os
 import sqlite3
 from contextlib import ExitStack, closing, suppress
 from functools import cache
@@ -142,6 +143,9 @@ def lock_store(path: Path) -> Any:
     except OSError:
         handle.close()
         raise StoreError(f"{path} is being written by another process; wait for it to end, or stop it") from None
+    if os.fstat(handle.fileno()).st_nlink == 0:  # its last holder has just removed it: others would lock another file
+        handle.close()
+        return lock_store(path)
     return handle
 
 

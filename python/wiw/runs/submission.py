@@ -28,6 +28,7 @@ from tyro.conf import arg
 from wiw.errors import ArgumentError, DependencyError, InfrastructureError, StoreError
 from wiw.files import atomic_file
 from wiw.json_text import parse_json
+from wiw.runs.status import status
 
 SIGNAL_DELAY = 90
 """Seconds before the time limit at which SLURM sends SIGUSR2."""
@@ -43,8 +44,8 @@ ACTIVE = frozenset(
     )
 )
 """States of jobs that are or may be waiting or running: `sacct` does not know a new job for some seconds."""
-FINISHED = (0, 1)
-"""Exit codes of a command that must not be run again: done, or done with an invalid run."""
+INVALID = 1
+"""Exit code of a command that has ended with an invalid run, but also of one that has crashed."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -119,13 +120,14 @@ class JobCommand:
         """Run the command to completion and return its exit code.
 
         Raises:
-            InfrastructureError: it ended with another exit code than `FINISHED`.
+            InfrastructureError: it failed: its exit code is not 0, nor that of an invalid run whose episodes have all
+                ended.
         """
         process = self._process = subprocess.Popen([sys.executable, "-m", "wiw.cli", *self.arguments])
         signal.signal(signal.SIGTERM, self._forward_signal)
         while (code := process.poll()) is None:  # wait() holds a lock that `checkpoint` would wait for
             time.sleep(0.1)
-        if code not in FINISHED:
+        if code != 0 and not (code == INVALID and _has_run_all(self.arguments)):
             raise InfrastructureError(f"exit code {code} of: {self}; its output says why. Submit it again to continue")
         return code
 
@@ -150,6 +152,17 @@ class JobCommand:
         if self._process is not None:
             with suppress(ProcessLookupError):
                 os.kill(self._process.pid, number)
+
+
+def _has_run_all(arguments: Sequence[str]) -> bool:
+    """Return whether all episodes of the run that a command writes have ended."""
+    if "--out" not in arguments:
+        return False
+    try:
+        found = status(arguments[list(arguments).index("--out") + 1])
+    except StoreError:
+        return False
+    return all(store.state == "done" for store in found.stores)
 
 
 def _wait_for_end(process: int) -> None:

@@ -18,6 +18,7 @@ from typing import Any
 
 from wiw.errors import ArgumentError, StoreError
 from wiw.runs.execute import read_recipes, require_own_sources, require_scenes
+from wiw.runs.limits import Limits
 from wiw.runs.rows import AgentRow, DecisionRow, LostRow, OutcomeRow, RestartRow, to_json
 from wiw.runs.store import DECISION_JSON, RunStore
 from wiw.runs.workers import Job, Runner, WorkerSpec
@@ -110,7 +111,8 @@ def _run_again(store: RunStore, keys: set[tuple[str, int]]) -> dict[tuple[str, i
     built, info, all_episodes = task.build(), store.info, store.episodes()
     store.require_task(built.describe())
     require_scenes(built, store, [all_episodes[index] for _, index in keys])
-    limits = {**info.get("limits", {}), "cache": "off", "lpips": None}
+    recorded = Limits(**info.get("limits", {}))
+    limits = {**recorded.to_json(), "cache": "off", "lpips": None, "fidelity": recorded.measures_fidelity}
     agents = {arm: recipe.replaying(store.path) for arm, recipe in agents.items()}
     pictures = frozenset(info["pictures"])
     spec = WorkerSpec(task, agents, store.config["seed"], store.salt, info["live"], pictures, limits, all_episodes)

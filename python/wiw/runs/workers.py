@@ -27,7 +27,7 @@ from wiw.errors import Error, InfrastructureError
 from wiw.isolation.source import end_idle_processes
 from wiw.runs.compose import RunContext
 from wiw.runs.limits import Limits
-from wiw.runs.rows import AgentRow, DecisionRow, LostRow, OutcomeRow, RestartRow, decision_row
+from wiw.runs.rows import AgentRow, DecisionRow, LostRow, OutcomeRow, RestartRow, decision_row, outcome_row
 from wiw.runs.sources import require_unchanged
 from wiw.types import DecisionRecord, Episode, EpisodeResult
 
@@ -95,7 +95,7 @@ class RowSink:
 
     def episode(self, result: EpisodeResult) -> None:
         """Record that an episode has ended."""
-        self._send(OutcomeRow(self._job.arm, result))
+        self._send(outcome_row(self._job.arm, result))
 
     def record_restart(self, episodes: Sequence[int]) -> None:
         """Note that these episodes begin anew."""
@@ -240,9 +240,12 @@ class _WorkerPool:
             has_news = worker.job is None or worker.pipe in ready  # one that starts or waits has none to send
             worker.silence.note(has_news, min(time.monotonic() - began, tick))
             if self._hangs(worker):
-                worker.process.kill()  # its pipe then ends
+                worker.process.kill()
         for pipe in ready:
             self._receive(by_pipe[pipe])  # type: ignore[index]
+        for worker in [worker for worker in self._workers if worker.process.exitcode is not None]:
+            if not worker.pipe.poll():  # a process that it has forked may hold its pipe open
+                self._replace_dead_worker(worker)
 
     def _is_free(self, worker: _Worker) -> bool:
         return worker.ready and worker.job is None and not self._hangs(worker)
@@ -402,7 +405,7 @@ def unpickle_spec(data: bytes) -> WorkerSpec:
         ) from error
 
 
-def make_portable(error: Exception) -> Exception:
+def make_portable(error: BaseException) -> Exception:
     """Return the exception itself where it survives pickling and is ours; else its text."""
     if isinstance(error, Error):
         try:

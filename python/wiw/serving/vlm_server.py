@@ -24,6 +24,8 @@ from wiw.wire.loopback import is_loopback
 
 MOST_BYTES = 256 << 20
 """Maximum size of a request's body in bytes."""
+UNHEARD = 60.0
+"""Seconds for which a client may send nothing, or take nothing of its answer, before it is disconnected."""
 UNCLEAR = (Error, ValueError, LookupError, TypeError, AttributeError, OverflowError, RecursionError)
 """Error for a request that makes no sense; anything else is a fault of the model or script behind the server."""
 
@@ -51,12 +53,12 @@ class VlmServer:
     """
 
     def __init__(self, client: Client, port: int = 0, host: str = "127.0.0.1", token: str | None = None) -> None:
-        if token is None and not is_loopback(host):
+        if not token and not is_loopback(host):
             raise ArgumentError(
                 f"serve-vlm: {host} can be reached from other machines: set WIW_TOKEN (or --token) to a secret that "
                 "clients send as OPENAI_API_KEY, such as the output of `openssl rand -hex 16`"
             )
-        self.client, self.token = client, token
+        self.client, self.token = client, token or None  # an empty one is none: anybody could send it
         self.requests: list[dict[str, Any]] = []
         """Bodies of the latest 1000 requests, without their images' data."""
         self.count = 0
@@ -124,6 +126,7 @@ class _Http(ThreadingHTTPServer):
 class _Handler(BaseHTTPRequestHandler):
     protocol_version = "HTTP/1.1"
     server_version = "wiw"
+    timeout = UNHEARD  # of the connection: its thread ends
 
     def log_message(self, *_: Any) -> None:
         """Log nothing: the server is asked thousands of times."""
@@ -159,7 +162,12 @@ class _Handler(BaseHTTPRequestHandler):
             self._send(404 if length <= MOST_BYTES else 413, _error(f"{self.path}: {length} bytes"))
             return
         try:
-            body = json.loads(self.rfile.read(length))
+            data = self.rfile.read(length)
+        except TimeoutError:
+            self.close_connection = True
+            return
+        try:
+            body = json.loads(data)
             response = server.respond(body, server.count_request(body))
             self._send(response.status, response.body, response.headers)
         except Exception as error:
@@ -184,7 +192,7 @@ class _Handler(BaseHTTPRequestHandler):
                 self.send_header(name, value)
             self.end_headers()
             self.wfile.write(data)
-        except (BrokenPipeError, ConnectionResetError):  # the client has had enough
+        except (BrokenPipeError, ConnectionResetError, TimeoutError):  # the client has had enough
             self.close_connection = True
 
 

@@ -18,6 +18,8 @@ from wiw.world_models.base import WorldModel, answer_deadline, check_rollout
 
 Outcome = NDArray[np.uint8] | Refusal
 """Frames of a row, or why there are none."""
+PICTURE_BREACHES = ("frame 0", "channels", "scale")
+"""Kinds of breaches of a model's contract that are one row's, and not of all that the model returned."""
 Report = Callable[[Sequence[Job], Sequence[Outcome]], None]
 
 
@@ -48,19 +50,24 @@ class Worker(threading.Thread):
     def _answers(self, rows: Sequence[Row]) -> list[Outcome]:
         """Return what the model gives for each row.
 
-        Where it raises, each half of the batch is computed again: a row that it cannot do fails alone, and too many
-        rows for the memory become fewer.
+        Where it raises, or shows another place than a row does, each half of the batch is computed again: a row that it
+        cannot do fails alone, whoever asked for the others, and too many rows for the memory become fewer.
         """
         try:
             frames = check_rollout(self._model, *stack(rows))
-        except ContractError as error:
-            return [Refusal(b"", error.kind, str(error)) for _ in rows]
         except BaseException as error:  # SystemExit too: the thread has to go on
-            if len(rows) == 1:
-                return [Refusal(b"", "raised", f"{type(error).__name__}: {' '.join(str(error).split())}")]
+            is_of_all = isinstance(error, ContractError) and error.kind not in PICTURE_BREACHES
+            if is_of_all or len(rows) == 1:
+                return [_refuse(error)] * len(rows)
             half = len(rows) // 2
             return [*self._answers(rows[:half]), *self._answers(rows[half:])]
         return [  # copies: they are encoded while the model goes on, and it may use its memory again
             answer[1 + row.control.shared : 1 + row.control.length].copy()
             for row, answer in zip(rows, frames, strict=True)
         ]
+
+
+def _refuse(error: BaseException) -> Refusal:
+    if isinstance(error, ContractError):
+        return Refusal(b"", error.kind, str(error))
+    return Refusal(b"", "raised", f"{type(error).__name__}: {' '.join(str(error).split())}")

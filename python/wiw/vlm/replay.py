@@ -7,6 +7,7 @@ import inspect
 import json
 import sqlite3
 from collections.abc import Sequence
+from contextlib import closing
 from pathlib import Path
 from typing import Any
 
@@ -62,9 +63,8 @@ def _read_answers(path: Path, model: str | None) -> tuple[dict[str, Completion],
     answers: dict[str, Completion] = {}
     models: set[str] = set()
     try:
-        connection = sqlite3.connect(f"file:{path}?mode=ro", uri=True)
-        rows = connection.execute("SELECT exchanges FROM decision WHERE exchanges != '[]'").fetchall()
-        connection.close()
+        with closing(sqlite3.connect(f"{path.absolute().as_uri()}?mode=ro", uri=True)) as connection:
+            rows = connection.execute("SELECT exchanges FROM decision WHERE exchanges != '[]'").fetchall()
         for exchange in (exchange for (text,) in rows for exchange in json.loads(text)):
             if model in (None, exchange["model"]):
                 models.add(exchange["model"])

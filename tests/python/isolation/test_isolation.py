@@ -15,6 +15,7 @@ import sys
 import threading
 import time
 from contextlib import suppress
+from copy import deepcopy
 from pathlib import Path
 
 import numpy as np
@@ -25,8 +26,9 @@ from locations import PYTHON_TESTS
 import wiw
 from wiw.action import FORWARD
 from wiw.errors import ArgumentError, ConstructionError, ContractError, RegistryError, RolloutError
+from wiw.isolation import models, source
 from wiw.isolation.failures import EndedError, ExitError, LateError, RaisedError
-from wiw.isolation.models import IsolatedModel
+from wiw.isolation.models import IsolatedModel, roll_out
 from wiw.isolation.process import _build_error
 from wiw.loop import attempts
 from wiw.loop.attempts import Attempted, make_model
@@ -135,6 +137,35 @@ def test_nothing_is_left_of_a_killed_process_and_its_children() -> None:
     assert count_descriptors() <= before
 
 
+def test_children_of_a_process_that_ends_by_itself_end_with_it(tmp_path) -> None:
+    head = (
+        "import os, subprocess, wiw\n"
+        "class Ending(wiw.WorldModel):\n"
+        "    accepts = wiw.accepts(control='image', view='perspective', size=(64, 128), frames=3)\n"
+        "    def rollout(self, observations, controls, seeds):\n"
+        "        child = subprocess.Popen(['sleep', '60'])\n"
+    )
+    for name, end, said in (("crash", "os._exit(3)", "exit code 3"), ("kill", "os.kill(os.getpid(), 9)", "SIGKILL")):
+        (tmp_path / f"{name}.py").write_text(f"{head}        {end}\n")
+        model = make_model(f"{tmp_path}/{name}.py:Ending", 60.0)
+        group = model._process._process.pid
+        with pytest.raises(EndedError, match=f"its process ended with {said}"):
+            model.rollout(observe(), CONTROLS, np.zeros(2, np.uint64))
+        deadline = time.monotonic() + 5
+        while _has_group(group) and time.monotonic() < deadline:
+            time.sleep(0.02)
+        assert not _has_group(group)
+
+
+def test_a_process_that_ends_between_look_and_call_is_not_taken_for_one_with_a_model(model) -> None:
+    process = model._find_process()
+    os.kill(process._process.pid, signal.SIGKILL)
+    os.waitid(os.P_PID, process._process.pid, os.WEXITED | os.WNOWAIT)
+    with pytest.raises(EndedError, match="SIGKILL"):
+        process.call(roll_out, observe(), CONTROLS, np.zeros(2, np.uint64), 20.0, answer=2 * 3 * SIZE[0] * SIZE[1] * 3)
+    np.testing.assert_array_equal(ask(model), imagine(observe(), CONTROLS))
+
+
 def _has_group(group):
     with suppress(ProcessLookupError):
         os.killpg(group, 0)
@@ -179,6 +210,33 @@ def test_answers_are_each_ones_own_and_inputs_may_be_kept(tmp_path) -> None:
     answers = [model.rollout(Conditioning(image), CONTROLS, np.zeros(2, np.uint64)) for image in shades]
     assert [int(answer.min()) for answer in answers] == [10, 10, 10] == [int(answer.max()) for answer in answers]
     assert not any(np.may_share_memory(one, other) for one in answers for other in answers if one is not other)
+
+
+def test_what_hangs_when_it_starts_anew_or_says_what_it_is_fails_by_a_deadline(tmp_path, monkeypatch) -> None:
+    file, marker = tmp_path / "hanging.py", tmp_path / "marker"
+    file.write_text(
+        "import os, time, wiw\n"
+        f"if os.path.exists({str(marker)!r}):\n"
+        "    time.sleep(99)\n"
+        "class Hanging(wiw.WorldModel):\n"
+        "    accepts = wiw.accepts(control='image', view='perspective', size=(64, 128), frames=3)\n"
+        "    def rollout(self, observations, controls, seeds):\n"
+        f"        open({str(marker)!r}, 'w').close()\n"
+        "        os._exit(3)\n"
+        "    def describe(self):\n"
+        "        time.sleep(99)\n"
+    )
+    monkeypatch.setattr(source, "STARTING", 0.5)
+    monkeypatch.setattr(models, "IDENTIFYING", 0.5)
+    made = make_model(f"{file}:Hanging", 20.0)
+    made._patience = 0.5
+    with pytest.raises(ConstructionError, match=r"cannot say what it is: no answer within 0\.5 s") as caught:
+        made.describe()
+    assert caught.value.kind == "deadline"
+    made = make_model(f"{file}:Hanging", 20.0)
+    made._patience = 0.5
+    with pytest.raises(RolloutError, match=r"cannot be loaded: no answer within 0\.5 s"):
+        Attempted(made, 20.0).rollout(observe(), CONTROLS, np.zeros(2, np.uint64))
 
 
 def test_construction_and_import_fail_by_kind(tmp_path) -> None:
@@ -297,6 +355,31 @@ def test_a_policy_s_new_process_takes_no_memory_for_one_of_the_old_one_s(tmp_pat
     gc.collect()
     assert [look(new), look(new)] == ["look 1, 0 done", "look 2, 0 done"]
     assert policy.spent == {"looks": 5}
+    policy.close()
+
+
+def test_a_copy_of_a_policy_s_memory_is_another_one_in_its_process_too(tmp_path) -> None:
+    """What is done with copies, such as scoring true futures for their fidelity, must change no decision."""
+    (tmp_path / "own.py").write_text(POLICY)
+    blank, key, goal = np.zeros((8, 16, 3), np.uint8), Key(0, 0), Goal("imagenav")
+    notes = []
+    for name in ("", "isolated:"):
+        policy = wiw.policy(f"{name}{tmp_path / 'own.py'}:Own")
+
+        def look(memory, policy=policy) -> str:
+            situation = Situation(Observation(blank, blank, np.zeros(3)), goal, key, memory)
+            policy.observe([situation])
+            return policy.propose([situation], 1, 3)[0][0].note
+
+        memory = policy.begin(goal, key)
+        look(memory)
+        copy = deepcopy(memory)
+        notes.append([look(copy), look(copy), look(memory), look(deepcopy(copy))])
+    assert notes[0] == notes[1] == [f"look {count}, 0 done" for count in (2, 3, 2, 4)]
+    policy.close()
+    policy.begin(goal, key)
+    with pytest.raises(RaisedError, match="process has ended, and its memory"):
+        deepcopy(memory)
     policy.close()
 
 

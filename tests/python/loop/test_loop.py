@@ -260,8 +260,8 @@ def test_what_fails_does_not_depend_on_what_else_is_live(task: ImageNav, live: i
 class Careless(Greedy):
     """Answers with whatever it was made with."""
 
-    def __init__(self, proposals=None, scores=None, plan=None) -> None:
-        self.proposed, self.scored, self.plan = proposals, scores, plan
+    def __init__(self, proposals=None, scores=None, plan=None, chosen=None) -> None:
+        self.proposed, self.scored, self.plan, self.chosen = proposals, scores, plan, chosen
 
     def propose(self, situations, candidates, horizon):
         good = super().propose(situations, candidates, horizon)
@@ -272,7 +272,7 @@ class Careless(Greedy):
         return good if self.scored is None else self.scored
 
     def revise(self, situation, proposals, scores):
-        return super().revise(situation, proposals, scores) if self.plan is None else (self.plan, None)
+        return super().revise(situation, proposals, scores) if self.plan is None else (self.plan, self.chosen)
 
 
 @pytest.mark.parametrize(
@@ -290,6 +290,10 @@ class Careless(Greedy):
         (Careless(scores=[]), "each of 1 episodes"),
         (Careless(plan=[]), "1 to 5 primitives"),
         (Careless(plan=[FORWARD] * 9), "1 to 5 primitives"),
+        (Careless(plan=[FORWARD], chosen=3), "number of one of 3 proposals, .*got 3"),
+        (Careless(plan=[FORWARD], chosen=-1), "number of one of 3 proposals, .*got -1"),
+        (Careless(plan=[FORWARD], chosen=1.0), r"number of one of 3 proposals, .*got 1\.0"),
+        (Careless(plan=[FORWARD], chosen=True), "number of one of 3 proposals, .*got True"),
     ],
 )
 def test_policies_are_held_to_their_contract(task: ImageNav, careless: Careless, said: str) -> None:

@@ -3,6 +3,7 @@
 
 from __future__ import annotations
 
+import errno
 import logging
 import threading
 from dataclasses import replace
@@ -15,6 +16,7 @@ import pytest
 import wiw
 from wiw.action import FORWARD, TURN_LEFT
 from wiw.errors import ArgumentError
+from wiw.loop import rollout_cache
 from wiw.loop.attempts import Attempted
 from wiw.loop.rollout_cache import Cached, RolloutCache, cache_rollouts, default_folder
 from wiw.runs.recipes import TaskRecipe
@@ -147,6 +149,20 @@ def test_a_damaged_entry_is_dropped_named_and_imagined_anew(tmp_path, caplog, ha
     assert imagine_rows(make(tmp_path), *question(FF))[1] == 0
 
 
+def test_an_entry_that_cannot_be_read_now_is_kept(tmp_path, caplog, monkeypatch) -> None:
+    def refuse(*_, **__):
+        raise OSError(errno.EMFILE, "Too many open files")
+
+    imagine_rows(make(tmp_path), *question(FF))
+    (path,) = tmp_path.rglob("*.frames")
+    whole = path.read_bytes()
+    with monkeypatch.context() as patched, caplog.at_level(logging.WARNING, "wiw.rollouts"):
+        patched.setattr(Path, "open", refuse)
+        assert imagine_rows(make(tmp_path), *question(FF))[1] == 1
+    assert f"{path} cannot be read now ([Errno 24] Too many open files)" in caplog.text
+    assert path.read_bytes() == whole and imagine_rows(make(tmp_path), *question(FF))[1] == 0
+
+
 def test_the_least_recently_used_goes_when_the_budget_is_spent(tmp_path) -> None:
     size = 32 + 2 * H * W * 3
     ask = make(tmp_path, budget_gb=10 * size / 2**30)
@@ -168,6 +184,19 @@ def test_where_nothing_can_be_written_the_run_goes_on_and_says_so_once(tmp_path,
     with caplog.at_level(logging.WARNING, "wiw.rollouts"):
         assert imagine_rows(ask, *question(FF))[1] == 1 and imagine_rows(ask, *question(FF, image=9))[1] == 1
     assert caplog.text.count("no longer cached") == 1
+
+
+def test_a_file_system_without_locks_costs_the_cache_and_no_rollout(tmp_path, caplog, monkeypatch) -> None:
+    def refuse(*_):
+        raise OSError(errno.ENOLCK, "No locks available")
+
+    monkeypatch.setattr(rollout_cache.fcntl, "flock", refuse)
+    ask = make(tmp_path / "cache")
+    with caplog.at_level(logging.WARNING, "wiw.rollouts"):
+        for image in (0, 9):
+            frames, rows = imagine_rows(ask, *question(FF, image=image))
+            assert rows == 1 and (frames[:, 0] == image).all()
+    assert caplog.text.count("no longer cached: [Errno 37] No locks available") == 1
 
 
 def test_many_writers_and_readers_agree(tmp_path) -> None:

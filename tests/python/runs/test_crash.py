@@ -19,7 +19,7 @@ from locations import PYTHON_TESTS
 
 import wiw
 from wiw.errors import FileError, StoreError
-from wiw.files import atomic_file, atomic_folder
+from wiw.files import _place, atomic_file, atomic_folder
 from wiw.runs.store import RunStore
 from wiw.runs.store_file import store_path
 from wiw.studies.run_log import load_run
@@ -252,7 +252,7 @@ def test_a_store_that_could_not_be_opened_is_not_held(reference, tmp_path):
 
 def test_files_are_whole_or_not_there(tmp_path):
     target, folder = tmp_path / "a.txt", tmp_path / "tables"
-    (tmp_path / ".a.txt.999999999.part").write_text("of a writer that was killed")
+    (tmp_path / f".a.txt.{_place()}-999999999.part").write_text("of a writer that was killed")
     with atomic_file(target) as draft:
         draft.write_text("first")
         assert not target.exists()

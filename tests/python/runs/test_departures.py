@@ -200,6 +200,12 @@ def test_every_difference_of_a_run_is_found(imported) -> None:
     assert find_topics(task, policy_options={"vlm": {"prompts": "minimal"}})["prompts"] == "minimal (paper: its own)"
 
 
+def test_the_key_of_a_server_is_no_departure_and_is_told_nobody(imported) -> None:
+    own = {"vlm": {**imported["vlm"], "key": "SECRET"}}
+    task = AR("apartments:val")
+    assert find_topics(task, policy_options=own) == find_topics(task, policy_options=imported)
+
+
 def test_prompts_are_the_papers_only_as_they_were_imported_for_the_task(imported) -> None:
     folder = Path(imported["vlm"]["prompts"])
     assert "prompts" not in find_topics(AR("apartments:val"), policy_options=imported)

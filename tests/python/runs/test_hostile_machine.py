@@ -7,6 +7,7 @@ import math
 import os
 import re
 import signal
+import time
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -34,6 +35,21 @@ class Mortal(LineAgent):
         marker = Path(self.markers, str(query.key.episode))
         if query.key.episode % 10 == 9 and not marker.exists():
             marker.touch()
+            os.kill(os.getpid(), signal.SIGKILL)
+        return super()._decide(query)
+
+
+@dataclass
+class Forking(LineAgent):
+    """Its process is killed once, and leaves a child of its own that holds all that it had open."""
+
+    def _decide(self, query: Any) -> Any:
+        marker = Path(self.marker)
+        if query.key.decision == 1 and not marker.exists():
+            if (child := os.fork()) == 0:
+                time.sleep(120)
+                os._exit(0)
+            marker.write_text(str(child))
             os.kill(os.getpid(), signal.SIGKILL)
         return super()._decide(query)
 
@@ -71,6 +87,16 @@ def test_a_worker_that_hangs_is_replaced_and_costs_no_result(tmp_path: Path) -> 
         run_arms(LineTask(), {"a": own}, 10, out=tmp_path / name, progress=False, salt="", **options)
         found.append(facts(tmp_path / name)[:3])
     assert (tmp_path / "marker").exists() and found[0] == found[1]
+
+
+def test_a_worker_that_is_killed_and_leaves_a_child_is_replaced(tmp_path: Path) -> None:
+    """The pipe to it does not end: the child has it, too."""
+    agent = Forking(marker=str(tmp_path / "child"))
+    try:
+        log = run_arms(LineTask(), {"a": agent}, 6, out=tmp_path / "run", progress=False, workers=2, stall=8.0)
+        assert {row["status"] for row in log.episodes} == {"done"} and len(log.episodes) == 6
+    finally:
+        os.kill(int((tmp_path / "child").read_text()), signal.SIGKILL)
 
 
 def test_an_episode_that_hangs_every_worker_is_an_error(tmp_path: Path) -> None:

@@ -10,6 +10,7 @@ import sys
 import time
 from collections import deque
 from contextlib import suppress
+from dataclasses import dataclass
 from types import SimpleNamespace
 
 import pytest
@@ -22,9 +23,9 @@ from wiw.errors import ArgumentError, ContractError, DependencyError, Infrastruc
 from wiw.runs import ray_engine
 from wiw.runs.config import EngineConfig, RunConfig
 from wiw.runs.execute import _group_by_scene
-from wiw.runs.recipes import AgentRecipe, TaskRecipe
+from wiw.runs.recipes import AgentRecipe, TaskInMemory, TaskRecipe
 from wiw.runs.rows import OutcomeRow
-from wiw.runs.workers import Job, WorkerSpec
+from wiw.runs.workers import Job, WorkerSpec, pickle_spec
 from wiw.studies.evaluate import evaluate, resume_run, run_arms
 from wiw.studies.run_log import load_run
 from wiw.types import EpisodeResult
@@ -108,6 +109,74 @@ def test_actors_without_work_take_that_of_a_lost_one():
     ray_engine._ActorPool(played, spec, jobs, receiver, 2, EngineConfig(engine="ray")).run()
     assert sorted(row.result.episode for row in rows) == [0, 1, 2, 3]
     assert [len(actor.jobs) for actor in made] == [2, 1, 1]  # the first, the lost one, and the one in its place
+
+
+class ActorWithoutServer(ActorInThisProcess):
+    """An actor whose first answers say that a server of the run was away for too long."""
+
+    failures = 2
+    kind = ""
+
+    def start(self, job):
+        self.jobs.append(job)
+        for index, episode in job.episodes:
+            lost = index == 1 and job.attempt < self.failures
+            status, kind = ("error", self.kind) if lost else ("done", "")
+            yield [OutcomeRow(job.arm, EpisodeResult(index, episode.episode_id, episode.scene, status, kind=kind))]
+
+
+@dataclass
+class Exiting:
+    """Recipe of an agent whose constructor means to end the process."""
+
+    reseed: int | None = None
+
+    def build(self, context, limits):
+        raise SystemExit(3)
+
+
+def test_a_constructor_that_ends_the_process_ends_no_job_in_silence():
+    spec = WorkerSpec(TaskInMemory(LineTask()), {"none": Exiting()}, 0, "", 2, frozenset())
+    actor = ray_engine.EpisodeActor(pickle_spec(spec), 1)
+    (rows,) = actor.run(Job("none", tuple(enumerate(LineTask().episodes(3)))))
+    assert [type(row) for row in rows] == [InfrastructureError] and "SystemExit: 3" in str(rows[0])
+
+
+@pytest.mark.parametrize(
+    ("kind", "failures", "errors", "begun"),
+    [
+        ("world_model/connection", 2, 0, 3),
+        ("vlm/unreachable", 2, 0, 3),
+        ("world_model/connection", 9, 1, 3),
+        ("world_model/deadline", 9, 1, 1),
+    ],
+)
+def test_an_episode_that_a_lost_server_has_cost_is_leased_again(monkeypatch, kind, failures, errors, begun):
+    monkeypatch.setattr(ActorWithoutServer, "kind", kind)
+    monkeypatch.setattr(ActorWithoutServer, "failures", failures)
+
+    def start(*given):
+        made.append(ActorWithoutServer(*given))
+        return made[-1]
+
+    made, rows = [], []
+    played = SimpleNamespace(
+        remote=lambda **options: lambda kind: SimpleNamespace(remote=start),
+        wait=lambda waiting, timeout: (waiting, []),
+        get=lambda row: row,
+        nodes=lambda: [{}],
+        exceptions=SimpleNamespace(RayActorError=RuntimeError, RayTaskError=KeyError),
+    )
+    episodes = list(enumerate(LineTask().episodes(3)))
+    receiver = SimpleNamespace(write=rows.append, discard=lambda arm, lost: None)
+    spec = WorkerSpec(None, {}, 0, "", 4, frozenset())
+    jobs = deque([Job("none", tuple(episodes))])
+    pool = ray_engine._ActorPool(played, spec, jobs, receiver, 1, EngineConfig(engine="ray"))
+    monkeypatch.setattr(ray_engine.ServerPool, "__len__", lambda pool: 1)
+    pool.run()
+    assert sorted(row.result.episode for row in rows) == [0, 1, 2]
+    assert sum(row.result.status == "error" for row in rows) == errors
+    assert sum(1 in dict(job.episodes) for each in made for job in each.jobs) == begun
 
 
 def test_an_episode_that_kills_every_actor_is_an_error_after_three_tries(ray, tmp_path):

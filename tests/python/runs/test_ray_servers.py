@@ -9,6 +9,7 @@ import subprocess
 import sys
 import threading
 import time
+from collections.abc import Sequence
 from contextlib import suppress
 from pathlib import Path
 
@@ -23,8 +24,9 @@ from wiw.cli import main
 from wiw.errors import ArgumentError, InfrastructureError
 from wiw.runs import ray_servers
 from wiw.runs.config import EngineConfig, RunConfig
+from wiw.runs.part_options import parse_options
 from wiw.runs.recipes import AgentRecipe, TaskRecipe
-from wiw.runs.servers import ask_servers, find_served, write_commands, write_vlm_commands
+from wiw.runs.servers import _format_option, ask_servers, find_served, write_commands, write_vlm_commands
 from wiw.studies.evaluate import evaluate, resume_run
 from wiw.studies.run_log import load_run
 from wiw.world_models.remote.model import ServedModel
@@ -296,6 +298,13 @@ def test_commands_and_agents_of_servers():
     for arm in ("big", "placebo"):
         assert (asking[arm].model, asking[arm].placebo) == (ServedModel, agents[arm].placebo)
         assert asking[arm].model_options["address"] == "ws://a,ws://b"
+
+
+def test_options_reach_a_served_model_as_they_are():
+    def make(weights: str | None = "own", steps: int = 3, revision: str = "", size: Sequence[int] = ()) -> None: ...
+
+    given = {"weights": None, "steps": 4, "revision": "null", "size": [480, 480]}
+    assert parse_options([_format_option(*item) for item in given.items()], make, "--world-model-option") == given
 
 
 def test_servers_without_a_model_or_with_several_are_refused(tmp_path):

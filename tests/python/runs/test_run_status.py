@@ -103,6 +103,16 @@ def test_time_left_follows_from_the_present_process(tmp_path):
     assert store.state == "stopped" and store.seconds_left is None
 
 
+def test_errors_that_are_tried_again_have_not_ended_when_a_session_begins(tmp_path):
+    """Else no time left could be told until as many had ended again."""
+    begin(tmp_path / "run")
+    with closing(sqlite3.connect(store_path(tmp_path / "run"))) as file, file:
+        file.execute("UPDATE outcome SET status = 'error' WHERE episode >= 2")
+    resume_run(tmp_path / "run", progress=False, retry_errors=True).close()
+    with RunStore.read(tmp_path / "run") as store:
+        assert store.info["session"]["ended"] == 2 and store.count_ended() == (6, 0)
+
+
 def test_a_process_is_told_from_a_later_one_with_its_number():
     own = describe_process()
     assert is_running(own) and not is_running({**own, "started": own["started"] + 1})

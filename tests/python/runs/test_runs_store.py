@@ -5,6 +5,7 @@ import json
 import re
 import sqlite3
 from contextlib import closing
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -13,10 +14,11 @@ from locations import TESTS
 
 import wiw
 from wiw import benchmark
-from wiw.errors import ArgumentError, StoreError
+from wiw.errors import ArgumentError, ContractError, StoreError
 from wiw.runs import store as store_module
 from wiw.runs.judges import JudgedRow, JudgeRecord
-from wiw.runs.rows import OutcomeRow, decision_row, decode_jpeg, encode_jpeg, strip, to_json
+from wiw.runs.recipes import AgentRecipe
+from wiw.runs.rows import OutcomeRow, decision_row, decode_jpeg, encode_jpeg, outcome_row, strip, to_json
 from wiw.runs.store import SCHEMA_VERSION, RunStore
 from wiw.studies.run_log import load_run
 from wiw.types import Decision, DecisionRecord, EpisodeResult, Goal, Observation, Proposal, Rollout, Truth
@@ -174,6 +176,16 @@ def test_a_store_of_an_older_schema_is_updated_when_it_is_resumed(old_run):
         connection.execute("UPDATE outcome SET status = 'failed'")
 
 
+@pytest.mark.parametrize("scratch", [None, "disk"])
+def test_a_run_that_another_version_must_continue_keeps_its_schema(old_run, tmp_path, monkeypatch, scratch):
+    """That version reads no newer one."""
+    begun_with = wiw.__version__
+    monkeypatch.setattr(wiw, "__version__", "99")
+    with pytest.raises(StoreError, match=f"was started by wiw {begun_with}, this is 99.*install that version"):
+        RunStore.resume(old_run, scratch=None if scratch is None else tmp_path / scratch)
+    assert version_and_statuses(old_run) == (7, ["done", "failed"])
+
+
 @pytest.mark.parametrize("version", [6, SCHEMA_VERSION + 1])
 def test_a_store_of_an_unknown_schema_is_refused(old_run, version):
     with closing(sqlite3.connect(old_run / "run.sqlite")) as connection:
@@ -229,6 +241,45 @@ def test_damaged_and_missing_stores_are_named(tmp_path):
         RunStore.read(tmp_path)
     with pytest.raises(StoreError, match="no run at"):
         load_run(tmp_path / "nowhere")
+
+
+@pytest.mark.parametrize(
+    ("change", "said"),
+    [
+        ({"note": None}, "note: expected str, got NoneType"),
+        ({"chosen": 2}, "expected .* one of them chosen"),
+        ({"spent": {"calls": "many"}}, "spent: calls: expected"),
+        (
+            {"proposals": (Proposal(np.array([1]), note=None), Proposal(np.array([2])))},
+            r"proposals: \[0\]\.note: expected",
+        ),
+    ],
+)
+def test_a_decision_that_could_not_be_read_again_is_refused_before_it_is_written(change, said):
+    """It would make all others of the run unreadable."""
+    good = record(0, 0)
+    bad = replace(good, decision=replace(good.decision, **change))
+    with pytest.raises(ContractError, match=f"arm warp, episode 0, decision 0: cannot be recorded: {said}"):
+        decision_row("warp", bad, with_images=False)
+    with pytest.raises(ContractError, match="arm warp, episode 1: cannot be recorded: metrics: success: expected"):
+        outcome_row("warp", EpisodeResult(1, "0001", "line/0", "done", {"success": "yes"}))
+
+
+def test_keys_and_tokens_of_servers_are_in_no_record(tmp_path):
+    """Reports show what a store says of agents and commands."""
+    asking = {"vlm": {"vlm": "http://host/v1", "key": "SECRET", "tries": 2}}
+    recipe = AgentRecipe(
+        "vlm", "remote:ws://a:1", model_options={"token": "SECRET", "patience": 3.0}, policy_options=asking
+    )
+    for said in (recipe.describe(), recipe.to_json()):
+        assert "SECRET" not in str(said)
+        assert said["model_options"] == {"patience": 3.0} and said["policy_options"]["vlm"]["tries"] == 2
+    assert recipe.policy_options["vlm"]["key"] == "SECRET"  # it is asked with
+    own = AgentRecipe("p.py:P", "m.py:M", model_options={"token": "t"}, policy_options={"p.py:P": {"key": "k"}})
+    assert own.to_json()["model_options"] == {"token": "t"} and own.to_json()["policy_options"] == own.policy_options
+    command = ["wiw", "run", "--policy-option", "key=SECRET", "--arms", "a=remote:ws://b?token=SECRET&patience=3,none"]
+    with RunStore.create(tmp_path / "told", CONFIG, {**INFO, "command": command}, LineTask().episodes(1)) as store:
+        assert store.info["command"][3:] == ["key=***", "--arms", "a=remote:ws://b?token=***&patience=3,none"]
 
 
 def test_records_become_data_frames(run):

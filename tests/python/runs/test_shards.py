@@ -3,6 +3,7 @@
 
 from __future__ import annotations
 
+import fcntl
 import os
 import shutil
 import signal
@@ -18,7 +19,8 @@ from locations import PYTHON_TESTS
 import wiw
 from wiw.cli import main
 from wiw.errors import ArgumentError, FileError, StoreError
-from wiw.runs import file_systems, scratch
+from wiw.runs import file_systems, scratch, store_file
+from wiw.runs.frame_scores import FrameScores
 from wiw.runs.recipes import AgentRecipe, TaskRecipe
 from wiw.runs.shards import Shard
 from wiw.runs.store import RunStore
@@ -164,6 +166,13 @@ def test_stores_of_unlike_runs_are_refused_and_the_difference_is_named(tmp_path,
     assert not (tmp_path / "merged").exists()
 
 
+def test_shares_of_decisions_whose_fidelity_was_measured_must_be_equal(tmp_path):
+    parts = run_shards(tmp_path, 2)
+    edit(parts[1], "UPDATE run SET info = json_set(info, '$.limits.fidelity_share', 0.5)")
+    with pytest.raises(StoreError, match=r"not from the same run: fidelity_share: 1\.0 and 0\.5"):
+        wiw.merge(parts, tmp_path / "merged")
+
+
 def test_unlike_agents_are_refused_though_the_first_store_has_not_begun_that_arm(tmp_path):
     parts = run_shards(tmp_path, 3)
     edit(parts[0], "UPDATE run SET info = json_remove(info, '$.built.none')")
@@ -251,6 +260,17 @@ def test_network_file_systems_are_told_from_disks(network, tmp_path):
     assert file_systems.find_network(network.with_name("net")) is None  # a longer name is no folder in it
 
 
+def test_scores_of_frames_have_no_log_on_a_network_file_system(network):
+    for folder, log in ((network, "delete"), (network / "disk", "wal")):
+        folder.mkdir(exist_ok=True)
+        with FrameScores(folder) as scores:
+            scores.add_scorer("s", {}, "command")
+            scores.write("s", "frame", {"sharpness": 1.0})
+            assert scores.read("s", ["frame"]) == {"frame": {"sharpness": 1.0}}
+        with closing(sqlite3.connect(scores.path)) as file:
+            assert file.execute("PRAGMA journal_mode").fetchone() == (log,)
+
+
 def test_a_store_on_a_network_file_system_is_refused_with_the_way_round(network, tmp_path):
     with pytest.raises(StoreError, match=r"network file system \(nfs4\).*--scratch /tmp.*wiw merge"):
         begin(network / "run")
@@ -321,6 +341,28 @@ def test_two_processes_do_not_share_a_scratch_copy(tmp_path):
         pytest.raises(StoreError, match="being written by another process"),
     ):
         RunStore.resume(tmp_path / "run", scratch=local)  # which would be lost when the other one's is closed
+
+
+def test_a_lock_that_its_holder_has_just_removed_holds_nothing(tmp_path, monkeypatch):
+    """Else one process would hold the file that is gone, and another the one that has come in its place."""
+    path, flock = tmp_path / "run.sqlite", fcntl.flock
+
+    def remove_first(handle, how):
+        monkeypatch.setattr(store_file.fcntl, "flock", flock)
+        path.with_suffix(".lock").unlink()
+        flock(handle, how)
+
+    monkeypatch.setattr(store_file.fcntl, "flock", remove_first)
+    with closing(store_file.lock_store(path)), pytest.raises(StoreError, match="being written by another process"):
+        store_file.lock_store(path)
+
+
+def test_a_merge_writes_where_temporary_files_belong(tmp_path, monkeypatch):
+    """Also where it is told so in the word of the other commands."""
+    parts = run_shards(tmp_path / "parts", 2)
+    monkeypatch.chdir(tmp_path)
+    assert wiw.merge(parts, tmp_path / "merged", scratch="auto").complete
+    assert sorted(path.name for path in tmp_path.iterdir()) == ["merged", "parts"]
 
 
 def test_a_merge_that_is_cut_off_leaves_nothing(tmp_path, monkeypatch):

@@ -163,6 +163,19 @@ def test_a_command_that_fails_is_an_error_of_its_job(tmp_path):
         JobCommand(["run", "nothing"])()
 
 
+def test_a_command_that_crashes_is_an_error_of_its_job_and_one_with_an_invalid_run_is_none(tmp_path):
+    """Both exit with code 1."""
+    (tmp_path / "bad.py").write_text(
+        "import wiw\nclass Bad(wiw.Policy):\n    propose = None\n    def describe(self):\n        1 / 0\n"
+    )
+    options = ["--episodes", "4", "--no-progress", "--no-report"]
+    crashing = [*options, "--policy", f"{tmp_path}/bad.py:Bad", "--out", str(tmp_path / "crashed")]
+    with pytest.raises(InfrastructureError, match="exit code 1 of: wiw run"):
+        JobCommand(["run", TASK, *crashing])()
+    broken = [*options, "--scenes", "broken", "--policy", "heuristic", "--out", str(tmp_path / "invalid")]
+    assert JobCommand(["run", TASK, *broken])() == 1
+
+
 def test_without_slurm_or_submitit_it_is_said(tmp_path, monkeypatch):
     with pytest.raises(InfrastructureError, match=r"srun.*--cluster local"):
         submit_commands(tmp_path, [["--version"]], ClusterConfig())

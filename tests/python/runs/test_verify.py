@@ -48,11 +48,29 @@ def test_a_run_comes_out_again_as_it_was_recorded(run, capsys):
     assert "everything is as recorded" in capsys.readouterr().out and store_path(run).read_bytes() == before
 
 
+def test_models_of_roles_are_replayed_too(tmp_path):
+    """Their servers may be gone, and would be asked, and paid, again."""
+    roles = {"revise": {"vlm": "http://gone:8000/v1", "model": "b"}, "answer": {"model": "c"}}
+    recipe = AgentRecipe("vlm", policy_options={"vlm": {"vlm": "http://x/v1", "model": "a", "roles": roles}})
+    replayed = recipe.replaying(tmp_path).policy_options["vlm"]
+    assert (replayed["vlm"], replayed["cache"], replayed["model"]) == (f"replay:{tmp_path}", "off", "a")
+    assert replayed["roles"] == {"revise": {"model": "b"}, "answer": {"model": "c"}}
+    assert "gone" in str(recipe.policy_options)  # the recipe itself is as it was
+
+
 def test_with_a_world_model_pictures_and_several_arms(two_rooms, tmp_path):
     task = TaskRecipe("imagenav", {"scenes": two_rooms, "decisions": 2})
     evaluate(task, AgentRecipe("matcher"), 2, out=tmp_path / "run", arms=["none", "warp"], progress=False)
     found = wiw.verify(tmp_path / "run", episodes=1)
     assert found.same and [check.arm for check in found.checks] == ["none", "warp"]
+
+
+def test_fidelity_that_was_measured_for_lpips_alone_is_measured_again(two_rooms, tmp_path):
+    """The weights of LPIPS may be missing here, and its numbers are not compared."""
+    task, run = TaskRecipe("imagenav", {"scenes": two_rooms, "decisions": 1}), tmp_path / "run"
+    evaluate(task, AgentRecipe("matcher", "copy"), 1, out=run, progress=False, fidelity=True).close()
+    change(run, "UPDATE run SET info = json_set(info, '$.limits.fidelity', json('false'), '$.limits.lpips', '/gone')")
+    assert wiw.verify(run).same
 
 
 @pytest.mark.parametrize(

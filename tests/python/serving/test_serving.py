@@ -239,6 +239,26 @@ def test_a_row_that_the_model_cannot_do_fails_alone():
         assert len(model.rows) == before and [2] in model.rows
 
 
+def test_a_row_that_shows_another_place_fails_alone():
+    """The others may be another client's."""
+
+    def act(observations):
+        frames = np.repeat(observations.image[:, None], 6, 1)
+        frames[observations.image[:, 0, 0, 0] == 2] ^= 255  # inverted
+        return frames
+
+    images = np.random.default_rng(0).integers(10, 246, (4, *SIZE, 3), np.uint8)
+    images[:, 0, 0, 0] = range(4)
+    model = Plain(act)
+    with remote(model) as (client, _):
+        with pytest.raises(ContractError, match="frame 0 is not the observation: it is inverted"):
+            client.rollout(Conditioning(images), plans(4), np.arange(4, dtype=np.uint64))
+        before = len(model.rows)
+        answered = client.rollout(Conditioning(images[:2]), plans(2), np.arange(2, dtype=np.uint64))
+        np.testing.assert_array_equal(answered[:, 5], images[:2])
+        assert len(model.rows) == before and [2] in model.rows
+
+
 @pytest.mark.parametrize(
     ("answer", "kind"),
     [

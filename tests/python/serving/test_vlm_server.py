@@ -27,6 +27,7 @@ pytest.importorskip("openai")
 
 from misbehaviour import FAULTS, MisbehavingVlmServer, Misbehaviour  # noqa: E402
 from wiw.errors import ArgumentError, VlmError  # noqa: E402
+from wiw.serving import vlm_server  # noqa: E402
 from wiw.serving.vlm_server import VlmServer  # noqa: E402
 from wiw.vlm import Request, connect, user  # noqa: E402
 from wiw.vlm.cache import ReplyCache  # noqa: E402
@@ -371,6 +372,20 @@ def test_a_body_without_a_length_is_refused(length: str) -> None:
         assert http.getresponse().status == 411
 
 
+@pytest.mark.parametrize(
+    "sent", [b"", b"POST /v1/chat", b"POST /v1/chat/completions HTTP/1.1\r\nContent-Length: 99\r\n\r\n{"]
+)
+def test_a_client_that_says_no_more_is_sent_away(sent: bytes, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Else each would hold a thread."""
+    monkeypatch.setattr(vlm_server._Handler, "timeout", 0.2)
+    with VlmServer(MockClient()) as server:
+        port = int(server.url.split(":")[2][:-3])
+        with closing(socket.create_connection(("127.0.0.1", port), timeout=10)) as client:
+            client.sendall(sent)
+            assert client.recv(1) == b""
+        assert connect(server.url).model == "mock"
+
+
 def test_wrong_requests_are_told_so() -> None:
     with VlmServer(MockClient()) as server:
         import openai
@@ -437,8 +452,12 @@ def test_a_server_with_a_token_answers_nobody_without_it(monkeypatch: pytest.Mon
         assert server.count == 1
         monkeypatch.setenv("OPENAI_API_KEY", "secret")
         assert pickle.loads(pickle.dumps(connect(server.url, key="secret"))).model == "mock"
-    with pytest.raises(ArgumentError, match="set WIW_TOKEN"):
-        VlmServer(MockClient(), host="0.0.0.0")
+    for token in (None, ""):  # an empty one anybody could send
+        with pytest.raises(ArgumentError, match="set WIW_TOKEN"):
+            VlmServer(MockClient(), host="0.0.0.0", token=token)
+    monkeypatch.setenv("OPENAI_API_KEY", "another")
+    with VlmServer(MockClient(), token="") as server:
+        assert connect(server.url, attempts=1).model == "mock"
 
 
 def test_the_command_announces_where_it_serves(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

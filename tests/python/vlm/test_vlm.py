@@ -312,17 +312,19 @@ def test_a_recorded_answer_is_given_again_and_nothing_else(tmp_path: Path) -> No
             {"call": said.call, **json.loads(json.dumps(said.completion.to_json()))} for said in reply.completions
         ],
     }
-    with sqlite3.connect(tmp_path / "run.sqlite") as connection:
+    run = tmp_path / "100%41? #1"  # which means something in an address
+    run.mkdir()
+    with sqlite3.connect(run / "run.sqlite") as connection:
         connection.execute("CREATE TABLE decision (exchanges TEXT)")
         connection.execute("INSERT INTO decision VALUES (?), ('[]')", (json.dumps([exchange]),))
-    replay = connect(f"replay:{tmp_path}")
+    replay = connect(f"replay:{run}")
     assert replay.model == "mock"
     np.testing.assert_array_equal(ask(replay, IMAGE, choices=("a", "b")).probabilities, reply.probabilities)
     with pytest.raises(VlmError, match="has no answer") as error:
         ask(replay, IMAGE, choices=("a", "c"))
     assert error.value.kind == "missing"
     with pytest.raises(FileError, match="one model, got none"):
-        connect(f"replay:{tmp_path}", model="another")
+        connect(f"replay:{run}", model="another")
     with pytest.raises(FileError, match="no run at"):
         connect(f"replay:{tmp_path / 'nowhere'}")
 
