@@ -15,7 +15,7 @@ from pathlib import Path
 from typing import Any
 
 from wiw.errors import StoreError
-from wiw.runs.file_systems import find_network
+from wiw.file_systems import find_network
 
 FILE_NAME = "quality.sqlite"
 APPLICATION_ID = 0x77697771

@@ -34,7 +34,8 @@ class Limits:
     infrastructure error, which is excluded from scores."""
     stall: Annotated[float | None, arg(metavar="SECONDS")] = None
     """Time in seconds without news from a worker process or Ray actor, such as a decision, after which it is stopped as
-    hung, and its episodes begin again; more than a model takes to load. Default: 2 hours, or 24 times --deadline."""
+    hung, and its episodes begin again; more than a model takes to load. Default: 2 hours, or 24 times --deadline. A run
+    of --workers 1 has no such process, and so no such limit."""
     cache: Annotated[str | Path, arg(metavar="auto|off|DIR")] = "auto"
     """Where rollouts are cached, so that a model never computes the same one twice: auto (~/.cache/wiw/rollouts, or
     $WIW_CACHE/rollouts, for models that declare themselves cacheable), a folder (for all that have a version, but never

@@ -20,9 +20,9 @@ from typing import Any
 import wiw
 from wiw import benchmark
 from wiw.errors import ArgumentError, StoreError
+from wiw.file_systems import find_network
 from wiw.runs import configurations
 from wiw.runs.faults import explain_faults, find_remedy
-from wiw.runs.file_systems import find_network
 from wiw.runs.judges import JudgedRow, JudgeRecord, apply_judge, find_judge
 from wiw.runs.migrations import OLDEST_READABLE, migrate, show_as_current
 from wiw.runs.processes import describe_process

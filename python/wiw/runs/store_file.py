@@ -12,8 +12,8 @@ from pathlib import Path
 from typing import Any
 
 from wiw.errors import StoreError
+from wiw.file_systems import find_network
 from wiw.runs.faults import explain_faults
-from wiw.runs.file_systems import find_network
 from wiw.runs.scratch import ScratchCopy
 
 FILE_NAME = "run.sqlite"

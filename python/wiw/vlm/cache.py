@@ -1,9 +1,9 @@
 # SPDX-License-Identifier: Apache-2.0
 """Answers on disk, so that no question to a model is asked, and paid for, twice.
 
-One SQLite file in WAL mode, which any number of processes may share, and a `ReplyCache` any number of threads. Answers
-are named by everything that they depend on (`Client.name_of`, `Client.manner`). When the file outgrows its budget,
-the least recently used answers are deleted first.
+One SQLite file, in WAL mode on a local disk, which any number of processes may share, and a `ReplyCache` any number of
+threads. Answers are named by everything that they depend on (`Client.name_of`, `Client.manner`). When the file outgrows
+its budget, the least recently used answers are deleted first.
 """
 
 from __future__ import annotations
@@ -19,6 +19,7 @@ from pathlib import Path
 from typing import Any
 
 from wiw.errors import ArgumentError
+from wiw.file_systems import find_network
 from wiw.vlm.messages import Completion
 
 _log = logging.getLogger("wiw.vlm")
@@ -91,7 +92,8 @@ class ReplyCache:
     def _open(self) -> sqlite3.Connection:
         if self._connection is None or self._process != os.getpid():
             connection = sqlite3.connect(self.folder / "replies.sqlite", timeout=30, check_same_thread=False)
-            connection.execute("PRAGMA journal_mode = WAL")
+            log = "DELETE" if find_network(self.folder) else "WAL"  # which is safe on a local disk alone
+            connection.execute(f"PRAGMA journal_mode = {log}")
             connection.execute("PRAGMA synchronous = NORMAL")
             connection.execute(_SCHEMA)
             self._connection, self._process = connection, os.getpid()

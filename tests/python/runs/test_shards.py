@@ -17,9 +17,10 @@ import pytest
 from locations import PYTHON_TESTS
 
 import wiw
+from wiw import file_systems
 from wiw.cli import main
 from wiw.errors import ArgumentError, FileError, StoreError
-from wiw.runs import file_systems, scratch, store_file
+from wiw.runs import scratch, store_file
 from wiw.runs.frame_scores import FrameScores
 from wiw.runs.recipes import AgentRecipe, TaskRecipe
 from wiw.runs.shards import Shard
@@ -27,6 +28,8 @@ from wiw.runs.store import RunStore
 from wiw.runs.store_file import store_path
 from wiw.studies.evaluate import evaluate, resume_run
 from wiw.studies.run_log import load_run
+from wiw.vlm.cache import ReplyCache
+from wiw.vlm.messages import Completion
 
 TASK = f"{PYTHON_TESTS / 'fakes.py'}:line_task"
 TABLES = {
@@ -268,6 +271,15 @@ def test_scores_of_frames_have_no_log_on_a_network_file_system(network):
             scores.write("s", "frame", {"sharpness": 1.0})
             assert scores.read("s", ["frame"]) == {"frame": {"sharpness": 1.0}}
         with closing(sqlite3.connect(scores.path)) as file:
+            assert file.execute("PRAGMA journal_mode").fetchone() == (log,)
+
+
+def test_cached_answers_have_no_log_on_a_network_file_system(network):
+    for folder, log in ((network / "replies", "delete"), (network / "disk/replies", "wal")):
+        cache = ReplyCache(folder)
+        cache.put({"name": Completion("yes")})
+        assert cache.get("name") == Completion("yes")
+        with closing(sqlite3.connect(folder / "replies.sqlite")) as file:
             assert file.execute("PRAGMA journal_mode").fetchone() == (log,)
 
 
