@@ -90,7 +90,7 @@ def test_list_names_everything_with_a_line(capsys):
         "imagenav",
         "spl",
         "wiw.world_models",
-        "predicts that every",
+        "Predict that every future frame",
     ):
         assert name in shown
 

@@ -441,8 +441,14 @@ def test_what_the_policy_needs_is_asked_for_in_words(situate: Any) -> None:
         tiny_policy(depth=3)
     with pytest.raises(ArgumentError, match="doubt: expected a number, got 'much'"):
         tiny_policy(doubt="much")
-    for out_of_range in ({"patience": 0}, {"spacing": -1}, {"targets": 0}, {"doubt": 1}, {"commitment": 2}):
-        with pytest.raises(ArgumentError, match=r"policy navigator: expected (patience|doubt)"):
+    for out_of_range, message in (
+        ({"patience": 0}, "expected patience above 0, got 0"),
+        ({"spacing": -1}, "expected spacing of 0 or more, got -1"),
+        ({"targets": 0}, "targets must be positive, got 0"),
+        ({"doubt": 1}, "expected doubt below 1"),
+        ({"commitment": 2}, "commitment of at most 1, got .* and 2"),
+    ):
+        with pytest.raises(ArgumentError, match=rf"policy navigator: .*{message}"):
             tiny_policy(**out_of_range)
 
 

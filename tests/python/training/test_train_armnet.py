@@ -117,8 +117,11 @@ def test_the_same_lesson_gives_the_same_network_stopped_or_not(plays: Plays, tmp
     assert checkpoint.load().step == 2
     resumed = train(plays, recipe, checkpoint=checkpoint)[0].state_dict()
     assert all(torch.equal(whole[name], resumed[name]) for name in whole)
-    for wrong in ({"epochs": 0}, {"steps": POSES + 1}):
-        with pytest.raises(ArgumentError, match="epochs"):
+    for wrong, message in (
+        ({"epochs": 0}, "epochs must be positive, got 0"),
+        ({"steps": POSES + 1}, f"at most {POSES} steps, got {POSES + 1}"),
+    ):
+        with pytest.raises(ArgumentError, match=message):
             Recipe(**wrong)
 
 
