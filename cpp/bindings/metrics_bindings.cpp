@@ -2,6 +2,8 @@
 #include <pybind11/pybind11.h>
 #include <pybind11/stl.h>
 
+#include <cmath>
+
 #include "arrays.hpp"
 #include "wiw/core/thread_pool.hpp"
 #include "wiw/metrics/pose_error.hpp"
@@ -39,7 +41,8 @@ template <class T, class Measure>
 Doubles compare(const Array<T>& a, const Array<T>& b, double range, const std::string& weights, Measure measure) {
   expect_shape(a, {-1, -1, -1, -1}, "images [B, H, W, C]");
   expect_shape(b, {a.shape(0), a.shape(1), a.shape(2), a.shape(3)}, "two batches of one shape [B, H, W, C]");
-  if (!(range > 0)) throw ArgumentError("data_range: expected a positive number, got " + std::to_string(range));
+  if (!(range > 0 && std::isfinite(range)))
+    throw ArgumentError("data_range: expected a positive number, got " + std::to_string(range));
   const Weighting weighting = to_weighting(weights);
   const Size size{.height = static_cast<int>(a.shape(1)), .width = static_cast<int>(a.shape(2))};
   const auto channels = static_cast<int>(a.shape(3));

@@ -7,6 +7,7 @@
 #include <pybind11/stl/filesystem.h>
 
 #include <limits>
+#include <optional>
 
 #include "arrays.hpp"
 #include "wiw/nav/distance_field.hpp"
@@ -120,8 +121,19 @@ py::object island_of(const NavMesh& mesh, const Array<float>& array) {
   return value_array(points.single, result);
 }
 
-py::array_t<float> sample(const NavMesh& mesh, std::size_t count, std::uint64_t seed, py::object island) {
-  const int index = island.is_none() ? -1 : island.cast<int>();
+/// An island to the C++ core, where -1 stands for all; in Python that is None, since island_of gives -1 off the mesh.
+int to_island(const NavMesh& mesh, std::optional<int> island) {
+  if (!island) return -1;
+  const auto islands = static_cast<int>(mesh.surface().islands.size());
+  if (*island < 0 || *island >= islands) {
+    throw ArgumentError("sample: expected an island from 0 to " + std::to_string(islands - 1) +
+                        ", or None for all of them, got " + std::to_string(*island));
+  }
+  return *island;
+}
+
+py::array_t<float> sample(const NavMesh& mesh, std::size_t count, std::uint64_t seed, std::optional<int> island) {
+  const int index = to_island(mesh, island);
   std::vector<Eigen::Vector3f> points;
   {
     const py::gil_scoped_release release;
@@ -317,7 +329,7 @@ floor, by another amount in every scene. What stands or is seen from there has t
       .def(py::init<const scene::Scene&>(), py::arg("scene"), py::call_guard<py::gil_scoped_release>())
       .def("put_down", &on_ground, py::arg("points"),
            "float32 [N, 3] (or [3]): points of a navigation mesh (metres) with the floor's height; the highest surface "
-           "from 0.45 m below to 0.1 m above counts. Points without any stay where they are.");
+           "from 0.45 m below to 0.1 m above counts. Points without any stay where they are, NaN included.");
 }
 
 void bind_construction(py::class_<NavMesh, std::shared_ptr<NavMesh>>& mesh) {
@@ -378,7 +390,7 @@ void bind_queries(py::class_<NavMesh, std::shared_ptr<NavMesh>>& mesh) {
            "int64 [N]: index into `islands` of the island nearest to each point, -1 off the mesh.");
   mesh.def("sample", &sample, py::arg("n"), py::arg("seed"), py::arg("island") = 0,
            "float32 [n, 3], uniform over the surface of one island (0 is the largest; None: of all); a function of "
-           "`seed` alone.");
+           "`seed` alone. ArgumentError for an island that does not exist.");
   mesh.def("try_step", &try_step, py::arg("start"), py::arg("end"), py::arg("sliding") = true,
            "Where straight steps from `start` towards `end` (float [N, 3] or [3]) come to stand: at a wall they slide "
            "along it, or stop with sliding=False. `start` itself where there is no way at all.");

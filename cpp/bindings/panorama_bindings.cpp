@@ -161,7 +161,7 @@ py::array resize_batch(const py::array& images, const Pair& size_pair) {
       throw ArgumentError("resize: uint32 images hold ids, which have no mean; expected uint8 or float32");
     } else {
       const ImageBatch<T> batch(images);
-      if (size.height < 1 || size.width < 1) throw ArgumentError("resize: expected a size (H, W) of at least 1 x 1");
+      check_resize(batch.size, size);  // before memory is taken
       py::array_t<T> out({static_cast<py::ssize_t>(batch.count), static_cast<py::ssize_t>(size.height),
                           static_cast<py::ssize_t>(size.width), static_cast<py::ssize_t>(batch.channels)});
       T* to = out.mutable_data();

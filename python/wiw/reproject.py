@@ -2,7 +2,7 @@
 """Reproject RGB-D images to other camera poses: what a moving camera would see of what is already known.
 
 A source is a panorama (depth is the distance along the ray) or, with a field of view given, a perspective view (depth
-is planar z). Depth is in metres, 0 where nothing is hit. A wrong shape, size or transform raises
+is planar z). Depth is in metres, 0 where nothing is hit. A wrong shape, size, type or transform raises
 ``wiw.errors.ArgumentError``.
 """
 
@@ -15,10 +15,12 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from wiw._core import reproject as _core
+from wiw.errors import ArgumentError
 
 __all__ = ["pose", "warp"]
 
 Size = tuple[int, int]
+OUTPUTS = ("color", "depth", "hole")
 
 
 @lru_cache(maxsize=16)
@@ -60,14 +62,19 @@ def warp(
         size: (h, w) of the results; None means the source's.
         target_hfov_deg: field of view of the results, if it differs from the source's; this renders perspective views
             of a panorama directly from its depth mesh.
-        outputs: any of "color" (uint8 [B, T, h, w, 3]), "depth" (float32 [B, T, h, w], as in the source's kind of
-            image, guesses included) and "hole" (bool [B, T, h, w], True where colour and depth are guessed).
+        outputs: any of "color" (uint8 [B, T, h, w, 3]), "depth" (float32 [B, T, h, w], planar z in perspective views
+            and distance along the ray in panoramas, guesses included) and "hole" (bool [B, T, h, w], True where colour
+            and depth are guessed).
         cut: the mesh is cut where neighbouring depths differ by more than this fraction and no plane explains it.
 
     Returns:
         The colour if ``outputs`` is ``("color",)``, otherwise a dict of the outputs.
     """
     color = np.asarray(color)
+    if color.dtype != np.uint8 or color.ndim != 4:
+        raise ArgumentError(f"color: expected uint8 [B, H, W, 3], got {color.dtype} {list(color.shape)}")
+    if unknown := [name for name in outputs if name not in OUTPUTS]:
+        raise ArgumentError(f"outputs: expected any of {OUTPUTS}, got {unknown}")
     source = (int(color.shape[1]), int(color.shape[2]))
     target = source if size is None else (int(size[0]), int(size[1]))
     target_hfov = hfov_deg if target_hfov_deg is None else target_hfov_deg

@@ -37,4 +37,5 @@ TEST_CASE("frame 0 is the observation") {
   CHECK(frames_of_actions(50, 14, Fit::kResample).back().frame == 13);
   CHECK_THROWS_AS(frames_of_actions(14, 14, Fit::kPad), ArgumentError);
   CHECK_THROWS_AS(frames_of_actions(1, 1, Fit::kChunk), ArgumentError);
+  CHECK_THROWS_AS(frames_of_actions(3, std::size_t{1} << 40, Fit::kResample), ArgumentError);
 }

@@ -46,4 +46,6 @@ TEST_CASE("steps that make no sense are refused") {
   CHECK_THROWS_AS(to_action(std::string("left")), ArgumentError);
   CHECK(ActionSpace{}.turns_per_circle() == 16);
   CHECK(ActionSpace{.turn_rad = 0.3}.turns_per_circle() == 0);
+  CHECK(ActionSpace{.turn_rad = radians(1e-3)}.turns_per_circle() == 360'000);
+  CHECK(ActionSpace{.turn_rad = radians(1e-9)}.turns_per_circle() == 0);
 }

@@ -1,9 +1,12 @@
 // SPDX-License-Identifier: Apache-2.0
 #include <doctest/doctest.h>
 
+#include <limits>
+
 #include "nav/rooms.hpp"
 #include "wiw/core/error.hpp"
 #include "wiw/nav/nav_mesh.hpp"
+#include "wiw/nav/waypoints.hpp"
 
 using namespace wiw;
 using namespace wiw::nav;
@@ -81,6 +84,37 @@ TEST_CASE("samples lie on the island asked for, and depend on the seed alone") {
   CHECK(mesh->sample(5, 3) == mesh->sample(5, 3));
   CHECK(mesh->sample(5, 3) != mesh->sample(5, 4));
   CHECK_THROWS_AS((void)mesh->sample(1, 0, 99), ArgumentError);
+}
+
+TEST_CASE("a body of more cells than Recast counts is refused, not wrapped") {
+  test::Soup soup;
+  soup.floor(0, 0, 30, 30);
+  const auto build = [&](const NavMeshSettings& settings) {
+    return NavMesh::from_triangles(soup.vertices, soup.triangles, settings);
+  };
+  NavMeshSettings wide;
+  wide.agent_radius = 6.3f;  // 126 cells
+  CHECK(build(wide)->area() < 17.4 * 17.4 + 1e-3);
+  wide.agent_radius = 6.4f;
+  CHECK_THROWS_WITH_AS(build(wide), doctest::Contains("raise cell_size"), ArgumentError);
+  NavMeshSettings fine;
+  fine.cell_height = 0.007f;  // 215 cells, and 28 to climb
+  CHECK(build(fine)->area() > 29 * 29);
+  fine.cell_height = 0.006f;
+  CHECK_THROWS_WITH_AS(build(fine), doctest::Contains("raise cell_height"), ArgumentError);
+}
+
+TEST_CASE("what is no number has no length and chooses no waypoints") {
+  constexpr float kNaN = std::numeric_limits<float>::quiet_NaN();
+  const auto mesh = mesh_of(two_rooms());
+  const std::vector<Vector3f> points{{1, 0, 1}, {kNaN, 0, 1}};
+  CHECK_THROWS_AS((void)mesh->surface_length(points), ArgumentError);
+  CHECK_THROWS_AS(select_waypoints(*mesh, 0, {.min_samples = 10, .mean_weight = kNaN}), ArgumentError);
+  CHECK_THROWS_AS(select_waypoints(*mesh, 0, {.min_samples = 10, .spacing = kNaN}), ArgumentError);
+  for (const double density : {-1.0, 1e300, static_cast<double>(kNaN)}) {
+    CHECK_THROWS_AS(select_waypoints(*mesh, 0, {.density = density, .min_samples = 10}), ArgumentError);
+  }
+  CHECK(!select_waypoints(*mesh, 0, {.density = 0, .min_samples = 10}).empty());
 }
 
 TEST_CASE("scenes with nothing to stand on, or too large, are refused") {

@@ -4,6 +4,7 @@
 #include <doctest/doctest.h>
 
 #include <cmath>
+#include <limits>
 #include <random>
 
 using namespace wiw;
@@ -43,6 +44,22 @@ TEST_CASE("the ground is the floor below a point that Recast has lifted") {
     CHECK(ground.height({0.5, height - 1, 0.5}) == height - 1);
   }
   CHECK(nav::Ground(scene::TriangleSoup{}).height({1, 2, 3}) == 2);
+}
+
+TEST_CASE("a point off the mesh, which snapping makes NaN, stays as it is") {
+  const nav::Ground ground(room(0));
+  constexpr double kNaN = std::numeric_limits<double>::quiet_NaN(), kInfinity = std::numeric_limits<double>::infinity();
+  CHECK(ground.height({kNaN, 0.1, 1}) == 0.1);
+  CHECK(ground.height({1, 0.1, kNaN}) == 0.1);
+  CHECK(std::isnan(ground.height({0.5, kNaN, 0.5})));
+  CHECK(ground.height({kInfinity, 0.1, -kInfinity}) == 0.1);
+  CHECK(ground.height({1e30, 0.1, -1e30}) == 0.1);
+}
+
+TEST_CASE("a strip that is long beyond measure takes no more memory than a floor") {
+  scene::TriangleSoup soup;
+  add_quad(soup, {0, 0, 0}, {0, 0, 0.001f}, {4e9f, 0, 0.001f}, {4e9f, 0, 0});
+  CHECK(nav::Ground(soup).height({5, 0.1, 0.0005}) == 0);
 }
 
 TEST_CASE("heights on a bumpy sheet are those of every triangle looked at") {

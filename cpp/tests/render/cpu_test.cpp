@@ -241,6 +241,11 @@ TEST_CASE("what cannot be drawn is refused with a typed error") {
   Pose broken = Pose::Identity();
   broken.translation().x() = std::numeric_limits<double>::quiet_NaN();
   CHECK_THROWS_AS(render(broken, kView), ArgumentError);
+  for (const double far : {1e19, 1e300}) {
+    Pose away = Pose::Identity();
+    away.translation().y() = -far;
+    CHECK_THROWS_AS(render(away, kView), ArgumentError);
+  }
   Pose flat = Pose::Identity();
   flat.linear().setZero();
   CHECK_THROWS_AS(render(flat, kView), ArgumentError);

@@ -38,7 +38,9 @@ void ActionSpace::check() const {
 }
 
 int ActionSpace::turns_per_circle() const {
+  constexpr double kMost = 1e6;  // finer turns: rounding alone would make every number a whole one
   const double turns = 2 * kPi / turn_rad;
+  if (turns > kMost) return 0;
   return std::abs(turns - std::round(turns)) < 1e-9 * turns ? static_cast<int>(std::lround(turns)) : 0;
 }
 

@@ -38,7 +38,7 @@ struct ActionSpace {
 
   /// Throws ArgumentError unless both steps are finite and positive and a turn is at most half a circle.
   void check() const;
-  /// Number of turns in a full circle if it is whole (16 for 22.5 degrees), else 0.
+  /// Number of turns in a full circle if it is whole (16 for 22.5 degrees) and at most a million, else 0.
   [[nodiscard]] int turns_per_circle() const;
 };
 

@@ -2,6 +2,7 @@
 #include "wiw/action/length.hpp"
 
 #include <cmath>
+#include <limits>
 
 #include "wiw/core/error.hpp"
 
@@ -40,9 +41,12 @@ std::vector<ActionSequence> chunk(std::span<const Action> actions, std::size_t l
 }
 
 std::vector<FrameIndex> frames_of_actions(std::size_t count, std::size_t frames, Fit fit) {
-  if (frames < 2) {
-    throw ArgumentError("frames_of_actions: expected at least 2 frames (the observation and one more), got " +
-                        std::to_string(frames));
+  constexpr std::size_t kMost = std::numeric_limits<int>::max();
+  if (frames < 2 || frames > kMost || count > kMost) {
+    throw ArgumentError(
+        "frames_of_actions: expected at least 2 frames (the observation and one more) and numbers "
+        "below 2^31, got " +
+        std::to_string(frames) + " frames and " + std::to_string(count) + " actions");
   }
   const std::size_t steps = frames - 1;
   if (fit == Fit::kPad && count > steps) {

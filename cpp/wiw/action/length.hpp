@@ -34,7 +34,8 @@ struct FrameIndex {
 
 /// For each of `count` actions, the frame of a model with `frames` frames that shows the outcome. Padded: frame k for
 /// the k-th action. Resampled from the start over the whole clip: the nearest of evenly spaced moments. Chunked: each
-/// chunk answers `frames` - 1 actions. Throws ArgumentError if frames < 2 or a padded plan does not fit.
+/// chunk answers `frames` - 1 actions. Throws ArgumentError if frames < 2, for numbers from 2^31 on,
+/// and if a padded plan does not fit.
 std::vector<FrameIndex> frames_of_actions(std::size_t count, std::size_t frames, Fit fit);
 
 }  // namespace wiw::action

@@ -45,8 +45,9 @@ Ground::Ground(const scene::TriangleSoup& soup) {
   }
   if (triangles_.empty()) return;
   origin_ = box.min();
-  const Eigen::Vector2d size = box.sizes().cast<double>();
-  cell_ = std::max(cell_, std::sqrt(size.x() * size.y() / kMostCells));
+  const Eigen::Vector2d size = box.max().cast<double>() - box.min().cast<double>();
+  // The last bound is for a strip narrower than a cell: its area does not tell how many cells it needs.
+  cell_ = std::max({cell_, std::sqrt(size.x() * size.y() / kMostCells), size.maxCoeff() / kMostCells});
   cells_ = (size / cell_).array().floor().cast<int>() + 1;
 
   // Counting sort: first how many triangles touch each cell, then where they go.
@@ -69,7 +70,7 @@ Ground::Ground(const scene::TriangleSoup& soup) {
 }
 
 double Ground::height(const Eigen::Vector3d& point) const {
-  if (triangles_.empty()) return point.y();
+  if (triangles_.empty() || !point.allFinite()) return point.y();  // a point that is NaN lies in no cell
   const Eigen::Vector2i cell = cell_of(point.x(), point.z());
   const std::size_t at = slot(cell.x(), cell.y());
   std::optional<double> best;

@@ -20,7 +20,8 @@ class Ground {
   explicit Ground(const scene::TriangleSoup& soup);
 
   /// The highest surface at (x, z) from 0.45 m below to 0.1 m above the point, which lies on a navigation mesh:
-  /// rounding and Recast's detail error lift that by up to two cells. The point's own y where there is no such surface.
+  /// rounding and Recast's detail error lift that by up to two cells. The point's own y where there is no such surface,
+  /// or where the point is not finite.
   [[nodiscard]] double height(const Eigen::Vector3d& point) const;
 
  private:

@@ -188,6 +188,9 @@ std::vector<double> NavMesh::distance_matrix(std::span<const Eigen::Vector3f> po
 
 double NavMesh::surface_length(std::span<const Eigen::Vector3f> points, float step) const {
   if (!(step > 0)) throw ArgumentError("expected a positive step, got " + std::to_string(step));
+  for (std::size_t i = 0; i < points.size(); ++i) {
+    if (!points[i].allFinite()) throw ArgumentError("expected finite points, got point " + std::to_string(i));
+  }
   const auto on_surface = [&](const Eigen::Vector3f& point) { return snap(point).value_or(point); };
   double metres = 0;
   for (std::size_t i = 1; i < points.size(); ++i) {

@@ -88,6 +88,22 @@ void check_extent(rcConfig& config) {
   config.height = std::max(config.height, 1);
 }
 
+// Recast counts cells below a ceiling, and twice the cells to a wall, in one byte each: more would wrap, or leave
+// floors that the agent can step between without a connection.
+void check_body(const rcConfig& config) {
+  constexpr int kMostRadius = 127;
+  constexpr int kMostHeight = 255;
+  if (config.walkableRadius > kMostRadius) {
+    throw ArgumentError("expected agent_radius of at most " + std::to_string(kMostRadius) + " x cell_size, got " +
+                        std::to_string(config.walkableRadius) + " cells; raise cell_size");
+  }
+  if (config.walkableHeight + config.walkableClimb > kMostHeight) {
+    throw ArgumentError("expected agent_height and agent_max_climb of at most " + std::to_string(kMostHeight) +
+                        " x cell_height together, got " + std::to_string(config.walkableHeight) + " and " +
+                        std::to_string(config.walkableClimb) + " cells; raise cell_height");
+  }
+}
+
 HeightfieldPtr voxelise(Context& context, const rcConfig& config, const NavMeshSettings& settings,
                         std::span<const Eigen::Vector3f> vertices,
                         std::span<const Eigen::Matrix<std::uint32_t, 3, 1>> triangles) {
@@ -222,6 +238,7 @@ std::vector<std::uint8_t> build_tile(std::span<const Eigen::Vector3f> vertices,
   check_triangles(vertices, triangles);
   Context context;
   rcConfig config = make_config(settings, vertices);
+  check_body(config);
   check_extent(config);
   const CompactPtr compact = partition(context, config, voxelise(context, config, settings, vertices, triangles));
   const PolygonsPtr polygons = trace(context, config, *compact);

@@ -19,7 +19,8 @@ struct WaypointOptions {
 };
 
 /// From a row-major [n, n] matrix of finite distances: places in descending order of leaf score of which no two are
-/// closer than `spacing`, chosen greedily. Ties go to the lower index.
+/// closer than `spacing`, chosen greedily. Ties go to the lower index. Throws ArgumentError for options that are no
+/// numbers.
 struct RankedPlaces {
   std::vector<std::size_t> index;
   std::vector<double> score;

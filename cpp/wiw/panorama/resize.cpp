@@ -46,13 +46,17 @@ T finish(float value) {
 
 }  // namespace
 
-template <class T>
-void resize_area(ImageView<const T> source, const Size& size, T* out) {
-  if (size.height < 1 || size.width < 1 || size.height > source.size.height || size.width > source.size.width) {
-    throw ArgumentError("resize: expected a size from 1 x 1 to " + std::to_string(source.size.height) + " x " +
-                        std::to_string(source.size.width) + ", got " + std::to_string(size.height) + " x " +
+void check_resize(const Size& source, const Size& size) {
+  if (size.height < 1 || size.width < 1 || size.height > source.height || size.width > source.width) {
+    throw ArgumentError("resize: expected a size from 1 x 1 to " + std::to_string(source.height) + " x " +
+                        std::to_string(source.width) + ", got " + std::to_string(size.height) + " x " +
                         std::to_string(size.width));
   }
+}
+
+template <class T>
+void resize_area(ImageView<const T> source, const Size& size, T* out) {
+  check_resize(source.size, size);
   const std::vector<Cover> rows = covers(source.size.height, size.height);
   const std::vector<Cover> columns = covers(source.size.width, size.width);
   const int channels = source.channels;

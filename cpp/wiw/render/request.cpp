@@ -23,6 +23,9 @@ void check_request(std::span<const Pose> T_world_camera, const Camera& camera) {
         rotation.determinant() < 0) {
       throw ArgumentError("render: T_world_camera[" + std::to_string(i) + "] is not a finite rigid transform");
     }
+    if (T_world_camera[i].translation().cwiseAbs().maxCoeff() > kFarthestCamera) {
+      throw ArgumentError("render: T_world_camera[" + std::to_string(i) + "] lies beyond 1e9 m from the origin");
+    }
   }
 }
 

@@ -134,6 +134,8 @@ def test_images_that_cannot_be_compared():
         metrics.ssim(a[:10], b[:10])
     with pytest.raises(ArgumentError, match="NaN"):
         metrics.ssim(np.full((11, 11, 1), np.nan), np.zeros((11, 11, 1)))
+    with pytest.raises(ArgumentError, match="data_range"):
+        metrics.psnr(a, b, data_range=np.inf)
     with pytest.raises(ArgumentError, match="latitude"):
         metrics.psnr(a, b, weights="sphere")
 

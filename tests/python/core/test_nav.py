@@ -12,7 +12,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from wiw.errors import ArgumentError, FileError, NavigationError
-from wiw.nav import NavMesh, NavMeshSettings, select_waypoints
+from wiw.nav import Ground, NavMesh, NavMeshSettings, select_waypoints
+from wiw.scenes import Scene
 
 pillars = st.tuples(st.floats(0, 7), st.floats(0, 5), st.floats(0.2, 3), st.floats(0.2, 3), st.floats(0, math.pi / 2))
 
@@ -295,6 +296,11 @@ def test_shapes_and_arguments(two_rooms):
     assert areas.sum() == pytest.approx(two_rooms.area, rel=1e-5)
     assert areas[island == 0].sum() == pytest.approx(two_rooms.islands[0].area, rel=1e-5)
     for call in (
+        lambda: two_rooms.sample(1, 0, island=two_rooms.island_of([60, 0, 0])),
+        lambda: two_rooms.sample(1, 0, island=len(two_rooms.islands)),
+        lambda: two_rooms.surface_length([one, [math.nan] * 3]),
+        lambda: two_rooms.select_waypoints(0, density=math.nan, min_samples=10),
+        lambda: select_waypoints(np.ones((2, 2)), mean_weight=math.nan),
         lambda: two_rooms.snap([[1, 2]]),
         lambda: two_rooms.geodesic_distance([one] * 2, [one] * 3),
         lambda: two_rooms.geodesic_distance(one, one, metric="euclid"),
@@ -305,6 +311,18 @@ def test_shapes_and_arguments(two_rooms):
     ):
         with pytest.raises(ArgumentError):
             call()
+    with pytest.raises(TypeError):
+        two_rooms.sample(1, 0, island="all")
+    found = {two_rooms.island_of(point) for point in two_rooms.sample(400, 0, island=None)}
+    assert found == set(range(len(two_rooms.islands)))
+
+
+def test_the_ground_leaves_points_off_the_mesh_as_they_are(two_rooms):
+    vertices, faces = twins.floor(0, 0, 10, 4)
+    scene = Scene.from_arrays([{"positions": np.asarray(vertices, np.float32), "triangles": np.asarray(faces)}])
+    points = np.array([[1, 0.2, 1], [60, 0.2, 1]], np.float32)
+    placed = Ground(scene).put_down(two_rooms.snap(points))
+    assert np.isnan(placed[1]).all() and placed[0, 1] == 0
 
 
 @pytest.mark.parametrize("name", ["nav_test", "dungeon", "small_house"])

@@ -146,6 +146,9 @@ def test_errors_say_what_was_expected():
         panorama.PerspectivePlan((10, 20), (4, 4), 90)(pano, 0)
     with pytest.raises(ArgumentError, match="finite"):
         panorama.rotate(pano, float("nan"))
+    for size in ((0, 4), (SIZE[0] + 1, 4), (2**31 - 1, 2**31 - 1)):
+        with pytest.raises(ArgumentError, match="resize"):
+            panorama.resize(pano, size)
     with pytest.raises(ArgumentError, match="faces"):
         panorama.from_cubemap(noise((5, 8, 8)), SIZE)
 

@@ -185,6 +185,8 @@ def test_read_only_buffers_are_refused(renderer):
 def test_bad_arguments_are_refused(renderer):
     with pytest.raises(ArgumentError, match="rigid"):
         renderer.perspective(np.zeros((4, 4)), (20, 30), 70)
+    with pytest.raises(ArgumentError, match="1e9 m"):
+        renderer.panorama(np.block([[np.eye(3), np.full((3, 1), 1e20)], [np.zeros((1, 3)), 1]]), (20, 30))
     with pytest.raises(ArgumentError, match=r"\[B, 4, 4\]"):
         renderer.perspective(np.zeros((2, 3, 4)), (20, 30), 70)
     with pytest.raises(ArgumentError, match="180"):

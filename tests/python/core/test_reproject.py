@@ -191,6 +191,12 @@ def test_errors_say_what_was_expected():
     color, depth = picture(sphere((20, 40)))
     with pytest.raises(ArgumentError, match=r"depth \[B = 1, 20, 40\]"):
         reproject.warp(color[None], depth[None, :, :-1], np.eye(4)[None, None])
+    with pytest.raises(ArgumentError, match="color: expected uint8"):
+        reproject.warp(color[None] / 255, depth[None], np.eye(4)[None, None])
+    with pytest.raises(ArgumentError, match="color: expected uint8"):
+        reproject.warp(color, depth, np.eye(4)[None, None])
+    with pytest.raises(ArgumentError, match="outputs"):
+        reproject.warp(color[None], depth[None], np.eye(4)[None, None], outputs=("holes",))
     with pytest.raises(ArgumentError, match="T_source_target"):
         reproject.warp(color[None], depth[None], np.eye(4)[None])
     with pytest.raises(ArgumentError, match="rigid"):

@@ -27,6 +27,7 @@ FACES = {
     "weight_file",
     "errors",
     "benchmark",
+    "file_systems",
     "files",
     "gymnasium_ids",
     "json_text",
