@@ -21,6 +21,7 @@ from wiw.files import atomic_file
 from wiw.metrics.metric import SUCCESS
 from wiw.runs.rows import to_json
 from wiw.runs.store import RunStore
+from wiw.scenes import strip_edits
 
 FOLDER = "blame"
 """Folder inside the run's that holds the reruns: a run store with one arm per arm and rerun."""
@@ -212,13 +213,18 @@ def list_failures(run: RunStore, arm: str) -> list[int]:
     judged = [row for row in run.outcomes() if row["arm"] == arm and row["status"] == "done"]
     if any("success" not in row["metrics"] for row in judged):
         raise ArgumentError(f"{run.path}: its task has no metric 'success', so none of its episodes counts as failed")
-    return [row["episode"] for row in judged if row["metrics"]["success"] < 1]
+    return [row["episode"] for row in judged if _is_failure(row)]
+
+
+def _is_failure(row: Mapping[str, Any]) -> bool:
+    """Return whether a scored episode failed; a part of a success, which a task of one's own may give, is a failure."""
+    return bool(row["metrics"]["success"] < 1)
 
 
 def list_reruns(run: RunStore, arm: str) -> list[str]:
     """Return the reruns that make a difference for an arm: the oracle's rollouts are the ground truth already."""
     agent = next(one["agent"] for one in run.config["arms"] if one["name"] == arm)
-    exact = agent.get("model") == "oracle" and "placebo" not in agent
+    exact = agent.get("model") == "oracle" and not {"placebo", "error"} & agent.keys()
     return [rerun for rerun in choose_scheme(run.config["task"]).reruns if not (exact and rerun == "imagination")]
 
 
@@ -237,7 +243,7 @@ def _read_arm(run: RunStore, arm: str, reruns: Mapping[tuple[str, int], Mapping[
         if cause := _find_error(rows):
             errors[episode] = cause
         elif all(row is not None for row in rows.values()):
-            success = {name: bool(row["metrics"]["success"]) for name, row in rows.items() if row is not None}
+            success = {name: not _is_failure(row) for name, row in rows.items() if row is not None}
             examined.append(EpisodeBlame(arm, episode, scenes[episode], success, scheme))
     return ArmBlame(
         arm,
@@ -261,7 +267,8 @@ def _find_error(rows: Mapping[str, Mapping[str, Any] | None]) -> str:
 
 def _estimate_recovery(examined: list[EpisodeBlame], rerun: str, seed: int) -> Estimate:
     values = [float(one.success[rerun]) for one in examined]
-    return estimate_mean(values, [one.scene for one in examined], SUCCESS, seed=seed)
+    scenes = [strip_edits(one.scene) for one in examined]  # intervals are over apartments, as in all tables
+    return estimate_mean(values, scenes, SUCCESS, seed=seed)
 
 
 def _name_episodes(arm: str, text: str, episodes: Iterable[int]) -> str:

@@ -28,6 +28,7 @@ from wiw.datasets.parquet_files import MANIFEST, require_pyarrow
 from wiw.errors import ArgumentError, FileError
 from wiw.files import atomic_file
 from wiw.mapping_files import read_json_object
+from wiw.scenes import strip_edits
 
 META = "meta.json"
 Part = Literal["all", "train", "held-out"]
@@ -38,7 +39,8 @@ class NavigationData(Sequence[NavigationSegment]):
 
     Args:
         folder: with `meta.json`.
-        part: "all"; or "train" or "held-out", two parts without a scene in common.
+        part: "all"; or "train" or "held-out", two parts without a scene in common; an edited apartment is in the
+            part of the one that it is a copy of.
         held_out: share of the scenes that are held out, chosen by a hash of their names.
 
     Raises:
@@ -57,7 +59,7 @@ class NavigationData(Sequence[NavigationSegment]):
         self.meta = read_meta(self.folder)
         """Camera, encoding, rules, scenes and checksums."""
         rows = read_segment_list(self.folder / SEGMENTS)
-        self.segments = [row for row in rows if part == "all" or part == part_of(row["scene"], held_out)]
+        self.segments = [row for row in rows if part == "all" or part == part_of(strip_edits(row["scene"]), held_out)]
         """Rows of `segments.parquet`: scene, file, row group, frames and action counts of each segment."""
         self._files: dict[str, FrameFile] = {}
 

@@ -178,7 +178,7 @@ def _with_ground_truth(recipe: AgentRecipe, stages: tuple[str, ...]) -> AgentRec
     if (counterpart := find_counterpart(recipe.policy, stages)) is not None:
         own = recipe.with_policy(counterpart.policy)
         return own if recipe.reviser is None else replace(own, reviser=counterpart.policy)
-    own = replace(recipe.with_model("oracle"), placebo=None) if "imagination" in stages else recipe
+    own = replace(recipe.with_model("oracle"), placebo=None, error=None) if "imagination" in stages else recipe
     return replace(own, ground_truth=stages)
 
 

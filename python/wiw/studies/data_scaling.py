@@ -20,9 +20,10 @@ import numpy as np
 from wiw.analysis.data_scaling import ScalingTable, Success, summarise_scaling
 from wiw.datasets.decisions import save_decisions
 from wiw.datasets.navigation import NavigationData
+from wiw.datasets.scene_splits import name_scene
 from wiw.errors import ArgumentError, FileError
 from wiw.files import atomic_file
-from wiw.scenes import resolve
+from wiw.scenes import resolve, strip_edits
 from wiw.studies.data_scaling_plan import (
     FULL,
     PRIMARY,
@@ -152,7 +153,7 @@ def make_plan(data: Path, settings: ScalingSettings) -> ScalingPlan:
     """Return the plan of a study on a dataset.
 
     Raises:
-        ArgumentError: the dataset has too few clips or scenes.
+        ArgumentError: the dataset has too few clips or scenes, or a scene of the decisions among those to train on.
         FileError: the dataset is missing or damaged.
     """
     trained, held_out = (NavigationData(data, part, settings.held_out) for part in ("train", "held-out"))
@@ -166,6 +167,7 @@ def make_plan(data: Path, settings: ScalingSettings) -> ScalingPlan:
             f"data-scaling: expected scenes to train on and others held out, got {len(trained)} segments to train on "
             f"and {len(held_out)} held out; choose another share (--held-out), or collect more scenes"
         )
+    _require_unseen(settings.decision_scenes, trained)
     clips = trained.clips(settings.length)
     if len(clips) < settings.clips:
         raise ArgumentError(
@@ -176,6 +178,21 @@ def make_plan(data: Path, settings: ScalingSettings) -> ScalingPlan:
     sizes = choose_sizes(settings.clips, settings.batch, settings.sizes)
     scenes, fewer_clips = choose_scenes(windows.tolist(), sizes)
     return ScalingPlan(settings, trained.digest(), sizes, scenes, fewer_clips)
+
+
+def _require_unseen(decision_scenes: str, trained: NavigationData) -> None:
+    """Check that no decision is made in a scene that is trained on, whatever the edits of an apartment.
+
+    Raises:
+        ArgumentError: names such a scene.
+    """
+    names = {strip_edits(row["scene"]) for row in trained.segments}
+    seen = next((spec for spec in resolve(decision_scenes) if strip_edits(name_scene(spec)) in names), None)
+    if seen is not None:
+        raise ArgumentError(
+            f"data-scaling: expected decisions in scenes that are not trained on, got {seen}; choose others "
+            "(--decision-scenes), such as apartments:val:40"
+        )
 
 
 def write_plan(plan: ScalingPlan, folder: Path) -> None:

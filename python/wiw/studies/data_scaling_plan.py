@@ -36,6 +36,8 @@ REGISTERED = (
 """Rules that are settled before the first training."""
 SPAN = 100
 """The largest size over the smallest."""
+STEP = 4
+"""Actions after which the primary error is taken."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -73,6 +75,11 @@ class ScalingSettings:
         if self.sizes < 3:
             raise ArgumentError(f"data-scaling: expected at least 3 sizes, for a trend, got {self.sizes}")
         require_positive("data-scaling", self, "batch", "held_out_clips", "decisions_per_scene")
+        if self.length <= STEP:
+            raise ArgumentError(
+                f"data-scaling: expected clips of at least {STEP + 1} frames, as errors are measured after {STEP} "
+                f"actions, got a length of {self.length}"
+            )
         if min(self.seeds) < 0:
             raise ArgumentError(f"data-scaling: expected seeds of 0 or more, got {self.seeds}")
 

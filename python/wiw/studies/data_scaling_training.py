@@ -19,7 +19,7 @@ from wiw.datasets.navigation import Clips, NavigationData, SelectedClips
 from wiw.errors import FileError
 from wiw.files import atomic_file
 from wiw.networks import single_thread
-from wiw.studies.data_scaling_plan import ScalingPlan, ScalingSettings, Training
+from wiw.studies.data_scaling_plan import STEP, ScalingPlan, ScalingSettings, Training
 from wiw.training.decision_errors import DecisionErrors, measure_decisions
 from wiw.training.held_out_clips import Frames, Imagine, imagine_with, measure_clips
 from wiw.training.held_out_panoramas import PanoramaClips, PanoramaErrors, select_panoramas, turn_panoramas
@@ -32,8 +32,6 @@ if TYPE_CHECKING:
 
 FRAMES, DECISIONS = "frames", "decisions.parquet"
 """Folder and file in a study's folder that all trainings read."""
-STEP = 4
-"""Actions after which the primary error is taken."""
 SAVED_EVERY = 60.0
 """Seconds between two writes of a training's state."""
 

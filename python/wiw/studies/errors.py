@@ -11,7 +11,7 @@ from __future__ import annotations
 import json
 from collections.abc import Callable, Mapping, Sequence
 from contextlib import ExitStack
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -189,8 +189,8 @@ def read_errors(out: str | Path, settings: ErrorSettings = FULL) -> ErrorStudy:
 
     Args:
         out: folder of the study.
-        settings: settings that it was started with; tasks in which no arm with an error has finished an episode are
-            left out.
+        settings: tasks, kinds and doses to show; everything else is as the study was started. Tasks in which no arm
+            with an error has finished an episode are left out.
 
     Raises:
         StoreError: this is so for all tasks.
@@ -203,7 +203,30 @@ def read_errors(out: str | Path, settings: ErrorSettings = FULL) -> ErrorStudy:
             f"errors: {folder} has no episode of an arm with an error so far (tasks {', '.join(settings.tasks)}, "
             f"errors {', '.join(settings.kinds)}); run the study without --read-only, or name its folder with --out"
         )
-    return ErrorStudy(found, settings, folder)
+    return ErrorStudy(found, _recall_settings([table.task for table in found], settings, folder), folder)
+
+
+def _recall_settings(tasks: Sequence[str], settings: ErrorSettings, folder: Path) -> ErrorSettings:
+    """Return the settings that the runs of these tasks were started with; kinds and doses are the given ones."""
+    with RunStore.read(_list_parts(folder / tasks[0])[0]) as store:
+        info, seed, episodes = store.info, store.config["seed"], len(store.episodes())
+    options, agent = info["task"]["options"], info["agents"][CEILING]
+    size = agent["model_options"].get("size")
+    recalled = replace(
+        settings,
+        tasks=tuple(tasks),
+        episodes=episodes,
+        seed=seed,
+        scenes=options.get("scenes"),
+        per_scene=options.get("per_scene", settings.per_scene),
+        preset=options.get("preset"),
+        tier=options.get("tier") if len(tasks) == 1 else None,
+        policy=None,
+        size=None if size is None else tuple(size),
+        fidelity_share=info["limits"]["fidelity_share"],
+    )
+    own = agent["policy"]
+    return recalled if own == recalled.find_policy(tasks[0]) else replace(recalled, policy=own)
 
 
 def _list_parts(folder: Path) -> list[Path]:
@@ -300,7 +323,7 @@ def _read_task(task: str, settings: ErrorSettings, parts: Sequence[Path]) -> Err
             return None
         return summarise_errors(
             task,
-            settings.find_policy(task),
+            logs[0].store.info["agents"][CEILING]["policy"],
             [row for log in logs for row in log.store.outcomes()],
             (row for log in logs for row in log.store.decisions()),
             settings.list_arms(task),

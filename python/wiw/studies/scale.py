@@ -19,9 +19,10 @@ from wiw.analysis.costs import costs
 from wiw.analysis.statistics import Estimate
 from wiw.analysis.summary import show_estimate
 from wiw.errors import ArgumentError
+from wiw.files import write_files
 from wiw.report.tables import print_stacked
 from wiw.runs.config import RunConfig, take_settings
-from wiw.runs.recipes import agent_recipe
+from wiw.runs.recipes import AgentRecipe, agent_recipe
 from wiw.runs.rows import to_json
 from wiw.studies.evaluate import run_arms
 from wiw.studies.run_log import RunLog
@@ -74,10 +75,13 @@ class Scaling:
         return str(success_by_rollouts({name.replace("_", " "): points for name, points in series.items()}))
 
     def save(self) -> tuple[Path, Path]:
-        """Write scale.json and scale.svg into the run's folder."""
+        """Write scale.json and scale.svg into the run's folder, and return their paths.
+
+        Raises:
+            FileError: they cannot be written.
+        """
         written = self.log.path / "scale.json", self.log.path / "scale.svg"
-        for path, text in zip(written, (self.to_json(), self.svg()), strict=True):
-            path.write_text(text, encoding="utf-8")
+        write_files(self.log.path, {"scale.json": self.to_json(), "scale.svg": self.svg()})
         return written
 
     def summary(self) -> None:
@@ -117,15 +121,23 @@ def scale(
             the proposer's own preference.
         config: settings of the run; with a folder as `cache`, any model computes only once what several amounts
             imagine.
-        settings: settings of `RunConfig` that override the config's, and options of a task given by name.
+        settings: settings of `RunConfig` that override the config's, and options of a task given by name. No episode
+            keeps images where `keep_images` is left at its default.
 
     Raises:
-        ArgumentError: an agent without a world model, a shard, or amounts that are missing, repeated or out of range.
+        ArgumentError: an agent without a world model, or of another method than `wiw.Agent`'s; a shard; or amounts that
+            are missing, repeated or out of range.
     """
-    if agent.model is None:
+    recipe = agent_recipe(agent)
+    if not isinstance(recipe, AgentRecipe):
+        raise ArgumentError(
+            f"scale: expected a wiw.Agent or an AgentRecipe, whose amount of imagination can be changed, got a "
+            f"{type(agent).__name__}"
+        )
+    if recipe.model is None:
         raise ArgumentError("scale: expected an agent with a world model, got one without")
     amounts = _list_amounts(candidates, imagine_fraction)
-    agents = {f"{sweep}={value:g}": _with(agent, changes) for (sweep, value), changes in amounts.items()}
+    agents = {f"{sweep}={value:g}": replace(recipe, **changes) for (sweep, value), changes in amounts.items()}
     own, task_options = take_settings(config, settings)
     if own.shard is not None:
         raise ArgumentError(
@@ -133,7 +145,9 @@ def scale(
             "candidates instead"
         )
     out = own.out or Path("runs") / f"scale-{datetime.now():%Y%m%d-%H%M%S}"
-    run_config = replace(own, out=out, keep_images=0, episodes=own.episodes or EPISODES)
+    keeps_images = "keep_images" in settings or own.keep_images != RunConfig.keep_images
+    kept = own.keep_images if keeps_images else 0
+    run_config = replace(own, out=out, keep_images=kept, episodes=own.episodes or EPISODES)
     log = run_arms(env_or_task, agents, config=run_config, **task_options)
     return Scaling(log, _measure_points(log, {f"{sweep}={value:g}": (sweep, value) for sweep, value in amounts}))
 
@@ -157,10 +171,6 @@ def _list_amounts(
         ("candidates", count): {"candidates": int(count), "pool": int(pool)} for count in candidates or []
     }
     return found | {("imagine_fraction", share): {"imagine_fraction": float(share)} for share in fractions or []}
-
-
-def _with(agent: Any, changes: Mapping[str, Any]) -> Any:
-    return replace(agent_recipe(agent), **changes)
 
 
 def _measure_points(log: RunLog, amounts: Mapping[str, tuple[str, float]]) -> tuple[ScalePoint, ...]:

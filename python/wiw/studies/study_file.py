@@ -180,7 +180,8 @@ def _read_run(name: str, content: Any, shared: Mapping[str, Any], where: str) ->
     check_arm_name(name, where)
     agents = _read_arms(content.get("arms"), content.get("agent") or {}, where)
     pairs = tuple((str(arm), str(base)) for arm, base in _require_pairs(content.get("compare") or [], where))
-    pairs = tuple(pair for pair in pairs if all(arm in agents for arm in pair) or _refuse_pair(pair, content, where))
+    named = content["arms"] if isinstance(content.get("arms"), Mapping) else agents
+    pairs = tuple(pair for pair in pairs if all(arm in agents for arm in pair) or _refuse_pair(pair, named, where))
     plots = _require_names(content.get("plots", ["success"]), f"{where}: plots")
     require_known(plots, PLOTS, f"{where}: plots")
     quality = _require_mapping(content.get("quality") or {}, f"{where}: quality") if "quality" in plots else None
@@ -236,14 +237,13 @@ def _merge(base: Mapping[str, Any], changes: Mapping[str, Any]) -> dict[str, Any
     return {**base, **both}
 
 
-def _refuse_pair(pair: tuple[str, str], content: Mapping[str, Any], where: str) -> bool:
-    """Return False for a pair with an arm that is left out by `when`.
+def _refuse_pair(pair: tuple[str, str], named: Mapping[str, Any], where: str) -> bool:
+    """Return False for a pair with an arm that is left out by `when`, of those that the file names.
 
     Raises:
         ArgumentError: the file names no such arm.
     """
-    arms = content.get("arms")
-    require_known(pair, arms if isinstance(arms, Mapping) else (), f"{where}: compare")
+    require_known(pair, named, f"{where}: compare")
     return False
 
 

@@ -22,6 +22,7 @@ from wiw.datasets.worlds import World, world
 from wiw.errors import ArgumentError
 from wiw.scenes import resolve
 from wiw.training.walks import OVERSAMPLING, StraightPath, find_straight_paths
+from wiw.types import check_seed
 
 HEADINGS, STEP = 16, 0.2
 SMALL = 144
@@ -78,11 +79,12 @@ def collect_decisions(
         progress: called after each scene with its name, and how many of how many are done.
 
     Raises:
-        ArgumentError: nowhere is there room, or `per_scene` is below 1.
+        ArgumentError: nowhere is there room, or `per_scene` or the seed is out of range.
         FileError: the scene does not exist.
     """
     if per_scene < 1:
         raise ArgumentError(f"decisions: expected per_scene of at least 1, got {per_scene}")
+    check_seed(seed)
     names, parts = resolve(specs), []
     for done, name in enumerate(names, 1):
         parts.append(construct_decisions(world(name), per_scene, seed, rules))

@@ -18,7 +18,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from wiw import scenes
-from wiw.datasets.worlds import world
+from wiw.datasets.worlds import navmesh_file, world
 from wiw.errors import ArgumentError, FileError
 from wiw.files import atomic_file
 from wiw.perception.glimpses import Glimpses
@@ -275,7 +275,17 @@ def _read_file(file: Path, job: Job) -> Arrays | None:
         return None
 
 
+def _describe_files(source: str) -> list[tuple[int, int]]:
+    """Return size and time of change of a scene's file and its navigation mesh; nothing of other sources.
+
+    What was recorded in a file that has been edited since is not used.
+    """
+    files = (Path(source), navmesh_file(source))
+    status = [file.stat() for file in files if file is not None and file.is_file()]
+    return [(each.st_size, each.st_mtime_ns) for each in status]
+
+
 def _compute_digest(source: str, job: Job) -> str:
     version, *rest = job.identity
-    identity = [version, build_digest(), source, *rest]
+    identity = [version, build_digest(), source, *_describe_files(source), *rest]
     return blake2b(json.dumps(identity).encode(), digest_size=12).hexdigest()

@@ -97,7 +97,8 @@ def join_glimpse_sets(parts: Sequence[GlimpseSets]) -> GlimpseSets:
 
 
 def split_in_half(data: GlimpseSets) -> tuple[GlimpseSets, GlimpseSets]:
-    """Split the sets into a first and a second half, which show different scenes, as sets are ordered by scene.
+    """Split the sets into a first and a second half. As sets are ordered by scene, the halves show different scenes,
+    except for the one in the middle.
 
     Raises:
         ArgumentError: there is only one set.

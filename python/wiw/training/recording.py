@@ -16,6 +16,7 @@ from wiw.errors import ArgumentError, InfrastructureError
 from wiw.render import Output
 from wiw.tabletop.base import TableSetup, TabletopTask
 from wiw.tabletop.workbench import WRIST, Film, Workbench
+from wiw.types import check_seed
 
 Backend = Literal["auto", "cpu", "gpu"]
 POSES = 15
@@ -54,6 +55,7 @@ class Collection:
         for name, least in (("episodes", 1), ("seed", 0)):
             if getattr(self, name) < least:
                 raise ArgumentError(f"collect: expected {name} of {least} or more, got {getattr(self, name)}")
+        check_seed(self.seed)
         if not 16 <= self.size <= 4096:
             raise ArgumentError(f"collect: expected a size from 16 to 4096 pixels, got {self.size}")
         if self.frames <= POSES:

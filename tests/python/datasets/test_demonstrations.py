@@ -327,6 +327,7 @@ def test_the_command_line(tmp_path: Path, capsys: pytest.CaptureFixture[str]) ->
     [
         ({"episodes": 0}, "expected episodes of 1 or more, got 0"),
         ({"seed": -1}, "seed of 0 or more"),
+        ({"seed": 2**64}, r"seed: expected a whole number from 0 to 2\*\*64 - 1"),
         ({"size": 8}, "16 to 4096"),
         ({"frames": 15}, "over 15 frames"),
         ({"format": "webp"}, "among jpeg, png, got webp"),

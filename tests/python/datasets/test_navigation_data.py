@@ -267,6 +267,17 @@ def test_parts_share_no_scene_and_scenes_stay_where_they_are(collected: Path) ->
         NavigationData(collected, "val")  # type: ignore[arg-type]
 
 
+def test_an_edited_apartment_is_in_the_part_of_the_one_that_it_is_a_copy_of(
+    collected: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    names = [f"apartments:train/{number}" for number in range(20)]
+    rows = [{"scene": name + edit} for name in names for edit in ("", "?remove:tv_1")]
+    monkeypatch.setattr("wiw.datasets.navigation.read_segment_list", lambda path: rows)
+    held_out = [row["scene"] for row in NavigationData(collected, "held-out", held_out=0.5).segments]
+    assert 0 < len(held_out) < len(rows)
+    assert held_out[1::2] == [f"{name}?remove:tv_1" for name in held_out[::2]]
+
+
 @pytest.mark.extra
 def test_datasets_loads_and_streams_it(collected: Path, tmp_path: Path) -> None:
     pytest.importorskip("datasets.arrow_dataset", reason="no datasets: pip install datasets")

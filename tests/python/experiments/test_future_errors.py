@@ -294,6 +294,8 @@ def test_an_arm_names_error_dose_and_model() -> None:
         ("error-blur", "expected KIND@DOSE with a number"),
         ("error-ignored@2", "expected a dose from 0 to 1"),
         ("error-blur@-1", "expected a dose from 0"),
+        ("error-blur@inf", "expected a dose from 0"),
+        ("error-lag@0.5", "expected a whole number of actions as dose, got 0.5"),
         ("error-blur@1:none", "of a world model"),
     ],
 )

@@ -18,7 +18,7 @@ from fakes import LineAgent, LineTask
 from locations import PYTHON_TESTS, TESTS
 
 import wiw
-from wiw.analysis.blame import EpisodeBlame, read_blame
+from wiw.analysis.blame import EpisodeBlame, _estimate_recovery, read_blame
 from wiw.analysis.blame_schemes import LOOP
 from wiw.cli import main
 from wiw.errors import ArgumentError, FileError, StoreError
@@ -106,6 +106,35 @@ def test_a_proposer_that_only_turns_is_to_blame(blamed: Any) -> None:
 def test_the_oracle_is_not_told_the_truth_twice(blamed: Any) -> None:
     assert set(blamed["oracle"].recovery) == {*LOOP.reruns} - {"imagination"}
     assert not any(arm == "oracle/imagination" for arm, _ in again(blamed.run))
+
+
+def test_an_oracle_with_an_error_is_told_the_truth(two_rooms: str, tmp_path: Path) -> None:
+    task = TaskRecipe("imagenav", {"scenes": two_rooms, "backend": "cpu", "radius": 1.5, "decisions": 2})
+    agent = AgentRecipe("matcher", "oracle", model_options={"size": [64, 128]})
+    evaluate(task, agent, 1, arms=["error-ignored@1"], out=tmp_path / "run", progress=False, keep_images=0).close()
+    change(tmp_path / "run", "UPDATE outcome SET metrics = json_set(metrics, '$.success', 0.0)")
+    line = wiw.blame(tmp_path / "run", progress=False)["error-ignored@1"]
+    assert set(line.recovery) == set(LOOP.reruns)
+    with RunStore.read(tmp_path / "run/blame") as reruns:
+        agents = {name.partition("/")[2]: agent for name, agent in reruns.info["agents"].items()}
+    assert {rerun: agent["error"] for rerun, agent in agents.items()} == {
+        "imagination": None, "scoring": "ignored@1", "proposals": "ignored@1", "all": None
+    }  # fmt: skip
+
+
+def test_a_part_of_a_success_mends_no_failure(blamed: Any, tmp_path: Path) -> None:
+    shutil.copytree(blamed.run, tmp_path / "run")
+    reruns = tmp_path / "run/blame"
+    change(reruns, "UPDATE outcome SET metrics = json_set(metrics, '$.success', 0.5) WHERE arm LIKE 'noise/%'")
+    with RunStore.read(tmp_path / "run") as store:
+        found = read_blame(store)
+    assert found is not None and found["noise"].verdicts["beyond"] == found["noise"].failures
+
+
+def test_intervals_of_recoveries_are_over_apartments() -> None:
+    scenes = ["apartments:val/1", "apartments:val/1?remove:tv_1", "apartments:val/2"]
+    examined = [EpisodeBlame("x", i, scene, {"all": bool(i)}) for i, scene in enumerate(scenes)]
+    assert _estimate_recovery(examined, "all", 0).scenes == 2
 
 
 def test_every_failure_and_only_failures_are_run_again(blamed: Any) -> None:

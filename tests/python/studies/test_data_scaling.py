@@ -183,6 +183,7 @@ def test_arms_differ_in_what_they_are_named_after() -> None:
         ({"models": ("svd",)}, "expected models among warpnet, pocket, got"),
         ({"seeds": (1, 1)}, "expected different seeds"),
         ({"sizes": 2}, "at least 3 sizes"),
+        ({"length": 4}, "clips of at least 5 frames, as errors are measured after 4 actions, got a length of 4"),
     ],
 )
 def test_settings_that_make_no_study_are_refused(changes: dict[str, Any], said: str) -> None:
@@ -384,6 +385,17 @@ def test_a_dataset_that_is_too_small_says_so(dataset: Path) -> None:
         make_plan(dataset, replace(SETTINGS, held_out=0.0))
     with pytest.raises(ArgumentError, match="expected a dataset for 12,800 clips"):
         wiw.data_scaling(None)
+
+
+def test_decisions_in_scenes_that_are_trained_on_are_refused(dataset: Path) -> None:
+    trained, held_out = (
+        NavigationData(dataset, part, SETTINGS.held_out).segments[0]["scene"] for part in ("train", "held-out")
+    )
+    with pytest.raises(ArgumentError, match=rf"scenes that are not trained on, got .*{trained}\.obj"):
+        make_plan(dataset, replace(SETTINGS, decision_scenes=str(dataset.parent / f"{trained}.obj")))
+    others = replace(SETTINGS, clips=12_800, decision_scenes=str(dataset.parent / f"{held_out}.obj"))
+    with pytest.raises(ArgumentError, match="expected 12800 clips"):  # the next thing that is checked
+        make_plan(dataset, others)
 
 
 @pytest.mark.parametrize(

@@ -3,16 +3,20 @@
 
 from __future__ import annotations
 
+import errno
 import json
 
 import numpy as np
 import pytest
+from fakes import LineAgent
 
 import wiw
 from wiw.cli.app import main
-from wiw.errors import ArgumentError
+from wiw.errors import ArgumentError, FileError
 from wiw.experiments.gating import Gated, is_consulted
 from wiw.loop.memory import Query
+from wiw.runs.config import RunConfig
+from wiw.runs.pictures import choose_pictured_episodes
 from wiw.runs.recipes import AgentRecipe
 from wiw.types import Goal, Key, Observation, Proposal
 
@@ -98,6 +102,31 @@ def test_a_sweep_in_python(two_rooms, tmp_path) -> None:
     assert 0 < by["imagine_fraction", 0.5].consultations < full.consultations
     numbers, plot = found.save()
     assert len(json.loads(numbers.read_text())["points"]) == 5 and "<svg" in plot.read_text()
+
+
+def test_an_agent_of_another_method_is_refused() -> None:
+    with pytest.raises(ArgumentError, match=r"expected a wiw.Agent or an AgentRecipe.*, got a LineAgent"):
+        wiw.scale("imagenav", LineAgent(0.0))
+
+
+def test_images_are_kept_where_they_are_asked_for_and_results_appear_whole(two_rooms, tmp_path, monkeypatch) -> None:
+    agent, options = AgentRecipe("heuristic", "copy", reviser="matcher"), {"scenes": two_rooms, "decisions": 1}
+    pictures = {}
+    cases = {"default": {}, "asked": {"keep_images": 2}, "config": {"config": RunConfig(keep_images=1)}}
+    for name, asked in cases.items():
+        found = wiw.scale("imagenav", agent, [1], episodes=2, out=tmp_path / name, progress=False, **asked, **options)
+        pictures[name] = len(choose_pictured_episodes(found.log.store))
+    assert pictures == {"default": 0, "asked": 2, "config": 1}
+    found.save()
+    monkeypatch.setattr("wiw.studies.scale.Scaling.svg", lambda self: "<svg>")
+    monkeypatch.setattr("os.fsync", full)
+    with pytest.raises(FileError, match=r"scale.json: cannot be written \(No space left"):
+        found.save()
+    assert json.loads((tmp_path / "config" / "scale.json").read_text())["points"]
+
+
+def full(file):
+    raise OSError(errno.ENOSPC, "No space left on device")
 
 
 def test_the_command(two_rooms, tmp_path, capsys) -> None:

@@ -157,6 +157,8 @@ def test_a_study_goes_on_where_it_stopped_and_gains_kinds(two_rooms: str, tmp_pa
     (table,) = found.tables
     assert [line.arm for line in table.lines] == ["error-blur@64", "error-ignored@1"] and table.episodes == 2
     stores = sorted((tmp_path / "study").rglob("run.sqlite"))
+    others = replace(settings, episodes=9, seed=5, scenes=None, size=None, policy="heuristic", fidelity_share=1.0)
+    assert read_errors(tmp_path / "study", others).to_json() == found.to_json(), "as it was started"
     with pytest.raises(StoreError, match="a different configuration"):
         study_errors(tmp_path / "study", replace(settings, kinds=("blur",)))
     again = study_errors(tmp_path / "study", settings)

@@ -119,6 +119,16 @@ def test_variables_are_filled_in_and_arms_are_merged(own: Path) -> None:
     assert parse_variables(["a=1", "b=[1, 2]", "c=x", "d="]) == {"a": 1, "b": [1, 2], "c": "x", "d": None}
 
 
+def test_a_pair_of_arms_named_by_text_says_which_is_unknown(tmp_path: Path) -> None:
+    file = tmp_path / "own.yaml"
+    run = {"task": "imagenav", "agent": {"policy": "matcher"}, "arms": "none,copy"}
+    file.write_text(yaml.safe_dump({"runs": {"here": {**run, "compare": [["copy", "none"]]}}}))
+    assert load_study(file).runs[0].compare == (("copy", "none"),)
+    file.write_text(yaml.safe_dump({"runs": {"here": {**run, "compare": [["copy", "nome"]]}}}))
+    with pytest.raises(ArgumentError, match=r"compare: unknown name 'nome'; expected one of none, copy.*mean none"):
+        load_study(file)
+
+
 @pytest.mark.parametrize(
     ("old", "new", "said"),
     [

@@ -38,6 +38,10 @@ def name_itself(name: str) -> Arrays:
     return {"name": np.array([ord(name)])}
 
 
+def read_length(name: str) -> Arrays:
+    return {"name": np.array([len(Path(name).read_text())])}
+
+
 def gather(folder: Path, workers: int, *more: str) -> list[int]:
     job = Job("letters", ("name",), name_itself, ("letters",))
     sources = SOURCES | {name: name for name in more}
@@ -62,6 +66,20 @@ def test_a_file_that_cannot_be_read_back_is_an_error(tmp_path: Path) -> None:
     job = Job("letters", ("name", "another field"), name_itself, ("letters",))
     with pytest.raises(FileError, match=r"letters: .*npz"):
         gather_arrays({"a": "a"}, job, tmp_path, 1, lambda items, text, total: items)
+
+
+@pytest.mark.parametrize("edited", ["rooms.obj", "rooms.navmesh"])
+def test_a_scene_that_has_changed_is_recorded_again(tmp_path: Path, edited: str) -> None:
+    (tmp_path / "rooms.obj").write_text("four")
+    job, name = Job("lengths", ("name",), read_length, ("lengths",)), str(tmp_path / "rooms.obj")
+
+    def record() -> int:
+        gather_arrays({name: name}, job, tmp_path / "cache", 1, lambda items, text, total: items)
+        return len(list((tmp_path / "cache").glob("*.npz")))
+
+    assert record() == record() == 1
+    (tmp_path / edited).write_text("longer")
+    assert record() == record() == 2
 
 
 def test_workers_end_with_the_process_that_started_them(tmp_path: Path) -> None:

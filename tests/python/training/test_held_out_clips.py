@@ -162,6 +162,8 @@ def test_rules_of_decisions_are_checked() -> None:
 def test_the_command_collects_decisions(two_rooms: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     out = tmp_path / "d.parquet"
     command = ["collect", "decisions", "--scenes", two_rooms, "--per-scene", "2", "--size", "16", "32"]
+    assert main([*command, "--plans", "3", "--seed", "-1", "--out", str(out)]) == 2
+    assert "seed: expected a whole number" in capsys.readouterr().err
     assert main([*command, "--plans", "3", "--out", str(out)]) == 0
     assert "2 decisions between 3 plans" in capsys.readouterr().out
     stored = load_decisions(out)

@@ -48,7 +48,7 @@ class Degradation(ABC):
     """Whether it acts on the simulator's fork, which only the oracle is given."""
 
     def __init__(self, dose: float) -> None:
-        if not 0 <= dose <= self.most:
+        if not (0 <= dose <= self.most and np.isfinite(dose)):
             largest = "" if np.isinf(self.most) else f" to {self.most:g}"
             raise ArgumentError(f"error '{self.kind}': expected a dose from 0{largest} ({self.unit}), got {dose:g}")
         self.dose = float(dose)

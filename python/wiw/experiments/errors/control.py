@@ -17,6 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from wiw.action import FORWARD, TURN_LEFT, TURN_RIGHT, ActionSpace
+from wiw.errors import ArgumentError
 from wiw.experiments.errors.base import Degradation, make_generator, per_space
 from wiw.experiments.errors.forks import Walker, WorldFork
 from wiw.metrics import pose_error
@@ -159,6 +160,11 @@ class Lag(MotionDegradation):
     unit = "actions"
     doses = per_space((1.0, 2.0, 4.0), (1.0, 2.0, 3.0))
 
+    def __init__(self, dose: float) -> None:
+        super().__init__(dose)
+        if not self.dose.is_integer():
+            raise ArgumentError(f"error 'lag': expected a whole number of actions as dose, got {dose:g}")
+
     def change_moves(self, moves: Moves, generator: np.random.Generator) -> Moves:
         """Return no move at first, then the plan's."""
         return np.concatenate([np.zeros_like(moves), moves])[len(moves) - self._count_late(moves) :][: len(moves)]
@@ -169,7 +175,7 @@ class Lag(MotionDegradation):
         return np.concatenate([np.repeat(poses[:1], late, axis=0), poses])[: len(poses)]
 
     def _count_late(self, plan: NDArray[np.float64]) -> int:
-        return min(round(self.dose), len(plan))
+        return int(min(self.dose, len(plan)))
 
 
 class Drift(MotionDegradation):
