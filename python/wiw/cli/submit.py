@@ -7,7 +7,7 @@ import math
 import shlex
 from dataclasses import replace
 from pathlib import Path
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated
 
 from tyro.conf import Positional, arg
 
@@ -20,6 +20,9 @@ from wiw.loop.config import AgentConfig
 from wiw.runs.config import RunConfig
 from wiw.runs.shards import Shard
 from wiw.runs.submission import FILE_NAME, ClusterConfig, SubmittedJob
+
+if TYPE_CHECKING:
+    from wiw.runs.recipes import AgentRecipe
 
 CLUSTER = ClusterConfig()
 SERVERS = "servers"
@@ -79,6 +82,8 @@ def submit(
             raise ArgumentError(f"submit: --{name} is set for each job; leave it out")
     if config.served is not None:
         raise ArgumentError("submit: --servers always serve --world-model; --served is for --engine ray only")
+    if server_partition is not None and not config.servers:
+        raise ArgumentError("submit: --server-partition is for the jobs of --servers: give their number with it")
     prepared = prepare_run(task, parts, arms, rules, search, replace(config, salt=_find_salt(config)))
     folder, count = Path(prepared.settings.out or ""), prepared.count
     Shard(1, shards).select(count)
@@ -206,12 +211,22 @@ def _name_servers(folder: Path) -> str:
 
 
 def _ask_servers(prepared: PreparedRun, folder: Path) -> str:
-    """Return the arms of a run with its model replaced by the served one, under the same name."""
+    """Return the arms of a run with its model replaced by the served one, under the same names.
+
+    Arms of the model with another policy, repeated, or as a placebo or with an error, ask the servers too.
+    """
+    own, served = str(prepared.agent.model), _name_servers(folder)
+    named = zip(prepared.arms or [own], prepared.recipes.items(), strict=True)
+    return ",".join(_ask_servers_for_arm(text, name, agent, own, served) for text, (name, agent) in named)
+
+
+def _ask_servers_for_arm(text: str, name: str, agent: AgentRecipe, own: str, served: str) -> str:
     from wiw.runs.arm_text import parse_arm
 
-    own = str(prepared.agent.model)
-    served = f"{prepared.agent.arm}={_name_servers(folder)}"
-    return ",".join(served if text == own else str(parse_arm(text)) for text in prepared.arms or [own])
+    arm = parse_arm(text)
+    if agent.model != own or not arm.model.endswith(own):  # an arm that names no model takes --world-model
+        return str(arm)
+    return f"{name}={arm.model.removesuffix(own)}{served}"  # options are the servers', equal in all arms
 
 
 def _is_done(shard: Path) -> bool:

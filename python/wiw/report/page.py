@@ -156,7 +156,8 @@ def sentence(summary: Summary, words: Wording | None = None) -> str:
     parts = []
     for line in shown[:3]:
         share = line.estimates["success"].value
-        rate = f"With {line.name}, the agent succeeded in {share:.1f} % of {line.scored_of_total} episodes"
+        count = f"{line.scored_of_total} episode{'' if line.scored_of_total == '1' else 's'}"
+        rate = f"With {line.name}, the agent succeeded in {share:.1f} % of {count}"
         found = (_find_difference(summary, line.name, "none", metric) for metric in ("success", "actions"))
         parts.append(rate + _describe_gain(next(found)) + _describe_actions(next(found), words or Wording()))
     return " ".join(parts)

@@ -32,8 +32,10 @@ from wiw.metrics.metric import SUCCESS
 from wiw.scenes import strip_edits
 from wiw.types import Wording
 
-LONGEST_LINE = 16
-"""Characters of an arm's name beside an axis."""
+LONGEST_LINE, LONGEST_WORD = 16, 28
+"""Characters of an arm's name beside an axis: on a line, and of a part that cannot be broken where its parts end."""
+LONGEST_LABEL, LABEL_LINE = 48, 30
+"""Characters of an arm's name in a legend that stands on one line, and of a line of a longer one."""
 INK = "#010203"
 """Stands for the page's text colour."""
 PALETTE = (
@@ -483,18 +485,29 @@ def _choose_text_color(color: str) -> str:
 
 
 def _fold(arm: str) -> str:
-    """Return an arm's name on lines of at most `LONGEST_LINE` characters, broken after -, + and : where it can be."""
+    """Return an arm's name on lines of at most `LONGEST_LINE` characters, broken after -, + and : where it can be, and
+    of at most `LONGEST_WORD` wherever it is.
+    """
     lines = [""]
     for piece in re.findall(r"[^-+:_]*[-+:_]?", arm):
         if lines[-1] and len(lines[-1]) + len(piece) > LONGEST_LINE:
             lines.append("")
         lines[-1] += piece
-    return "\n".join(lines)
+    return "\n".join(_break(line, LONGEST_WORD) for line in lines)
 
 
 def _label(arm: str) -> str:
-    """Return an arm's name for a legend, from which matplotlib leaves out those that begin with an underscore."""
-    return f" {arm}" if arm.startswith("_") else arm
+    """Return an arm's name for a legend, on several lines where it is longer than `LONGEST_LABEL`.
+
+    matplotlib leaves out names that begin with an underscore.
+    """
+    shown = f" {arm}" if arm.startswith("_") else arm
+    return shown if len(shown) <= LONGEST_LABEL else _break(shown, LABEL_LINE)
+
+
+def _break(text: str, most: int) -> str:
+    """Return a text on lines of at most `most` characters."""
+    return "\n".join(text[begin : begin + most] for begin in range(0, max(1, len(text)), most))
 
 
 def _make_figure(rows: Sequence[str] = ()) -> tuple[Figure, Axes]:
@@ -519,10 +532,11 @@ def _style_axes(axes: Axes) -> None:
 
 def _draw_legend(axes: Axes) -> None:
     texts = axes.get_legend_handles_labels()[1]
-    longest = max(map(len, texts), default=0)
+    longest = max((len(line) for text in texts for line in text.split("\n")), default=0)
     widest = 4 if longest < 11 else 2 if longest < 20 else 1  # columns that fit the drawing's width
     columns = math.ceil(len(texts) / math.ceil(len(texts) / widest)) if texts else 1  # rows of about equal length
-    more = math.ceil(len(texts) / columns) - LEGEND_ROWS
+    broken = sum(text.count("\n") for text in texts)
+    more = math.ceil(len(texts) / columns) + broken - LEGEND_ROWS
     if isinstance(figure := axes.figure, Figure):
         figure.set_figheight(figure.get_figheight() + LINE * max(0, more))
     axes.legend(frameon=False, labelcolor=INK, fontsize=9, ncols=columns, loc="lower left", bbox_to_anchor=(0, 1))

@@ -142,7 +142,7 @@ def stack_tables(
 ) -> list[Table]:
     """Return as many tables as it takes to fit `columns` into a terminal, with a row per name in each.
 
-    Long names are folded; numbers are never cut.
+    Long names are folded; numbers are never cut. All text is shown as it is, without rich's markup in brackets.
     """
     first = min(max(map(cell_len, names), default=0), LONGEST_NAME)
     groups: list[list[Column]] = [[]]
@@ -154,11 +154,13 @@ def stack_tables(
     tables: list[Table] = []
     for group in groups:
         table = _make_table(f"{title} (continued)" if tables else title)
-        table.add_column(heading, style="bold", width=max(first, len(heading)), overflow="fold")
+        table.add_column(Text(heading), style="bold", width=max(first, len(heading)), overflow="fold")
         for column in group:
-            table.add_column(column.title, justify="right", style=column.style, no_wrap=True, min_width=column.width)
+            head = Text(column.title)
+            table.add_column(head, justify="right", style=column.style, no_wrap=True, min_width=column.width)
         for row, name in enumerate(names):
-            table.add_row(name, *(column.cells[row] for column in group))
+            cells = (column.cells[row] for column in group)
+            table.add_row(Text(name), *(cell if isinstance(cell, Text) else Text(cell) for cell in cells))
         tables.append(table)
     return tables
 
@@ -189,9 +191,8 @@ def _list_tables(summary: Summary, width: int) -> list[Any]:
 
 def _make_table(title: str) -> Table:
     return Table(
-        title=title,
+        title=Text(title, "bold"),
         title_justify="left",
-        title_style="bold",
         box=box.SIMPLE_HEAD,
         pad_edge=False,
         padding=(0, 1, 0, 0),
@@ -227,7 +228,8 @@ def _tabulate_utilities(summary: Summary) -> Table:
     for found in summary.utilities:
         style = "" if found.is_defined and not found.reference else "dim"
         shown = Text(show_utility(found), style=style)
-        table.add_row(found.arm, shown, str(found.n), Text("reference" if found.reference else "", style="dim"))
+        note = Text("reference" if found.reference else "", style="dim")
+        table.add_row(Text(found.arm), shown, str(found.n), note)
     return table
 
 

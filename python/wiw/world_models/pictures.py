@@ -55,17 +55,20 @@ def check_pictures(
 ) -> None:
     """Hold an answer to showing what was observed; `observations` are samples of the images that were handed over.
 
-    Looked at are frame 0, and the frames that are each row's own.
+    Looked at are frame 0, and the frames that are each row's own. These may be black where nothing is known of what
+    lies there, but not from everywhere.
 
     Raises:
         ContractError: frame 0 is another picture ("frame 0"), red and blue are exchanged ("channels"), or floats were
             cast without their scale ("scale").
     """
+    black, lit = set[bytes](), False
     for observed, row, control in zip(observations, sample(frames), controls, strict=True):
         own = row[1 + control.shared : 1 + control.length]
         if observed.std() <= FLAT:
             continue
-        if observed.mean() > DARK and max(own.max(initial=0), row[0].max()) <= 1:
+        bright = observed.mean() > DARK
+        if bright and max(own.max(initial=0), row[0].max()) <= 1:
             raise ContractError(f"{name}.rollout: {SCALE}", "scale")
         expected = observed.astype(np.float32)
         exact = np.array_equal(row[0], observed)
@@ -77,12 +80,17 @@ def check_pictures(
             )
         if len(own) == 0:
             continue
-        if observed.mean() > DARK and own.max() <= 1:
+        if bright and own.max() == 1:
             raise ContractError(f"{name}.rollout: after frame 0, {SCALE}", "scale")
+        if bright and control.shared == 0 and own.max() == 0:  # as behind a wall, of which a front view shows nothing
+            black.add(observed.tobytes())
+        lit = lit or bool(own.max() > 1)
         # The frame after one action shows nearly what was observed. Later ones may show another wall by chance.
         least = OTHER if control.shared == 0 else ALIKE
         if are_channels_swapped(expected, own[0].astype(np.float32), least):
             raise ContractError(f"{name}.rollout: after frame 0, {CHANNELS}", "channels")
+    if len(black) > 1 and not lit:
+        raise ContractError(f"{name}.rollout: after frame 0, {SCALE}", "scale")
 
 
 def find_first_frame_fault(observed: Picture, found: Picture) -> str:

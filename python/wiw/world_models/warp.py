@@ -42,7 +42,7 @@ class Warp(WorldModel):
         if (view, size) != ("panorama", None):  # named in the manifest only where they are chosen
             self.view, self.size = view, size
             self.accepts = accepts(
-                control="trajectory", view=view, size=size, needs=("depth",), causal=True, best_batch=64
+                control="trajectory", view=view, size=size, needs=("depth",), causal=True, best_batch=64, seeded=False
             )
 
     def rollout(

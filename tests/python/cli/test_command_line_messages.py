@@ -14,6 +14,7 @@ from locations import PYTHON_TESTS, ROOT
 
 from wiw import errors
 from wiw.cli import main
+from wiw.cli.bars import Bars
 from wiw.cli.demo import PARTS
 from wiw.errors import VlmError
 from wiw.registry import TASKS
@@ -205,3 +206,14 @@ def test_without_a_server_the_mock_is_suggested() -> None:
     client = OpenAIClient(f"http://127.0.0.1:{port}/v1", attempts=1)
     with pytest.raises(VlmError, match=r"no server answers there.*--vlm mock"):
         _ = client.model
+
+
+def test_bars_show_text_as_it_is_and_follow_a_total_that_grows(capsys: pytest.CaptureFixture[str]) -> None:
+    with Bars() as bars:
+        for done in range(1, 5):
+            bars.show("measuring", done, done + 1, f"[red]{done}[/x]")
+        bars.show("files", 0, 0, "none")
+        measuring = bars._bars.tasks[0]
+        assert (measuring.completed, measuring.total) == (4, 5)
+    lines = capsys.readouterr().err.splitlines()
+    assert "measuring: [red]1[/x]" in lines and lines[-1].startswith("measuring")

@@ -128,7 +128,9 @@ def test_training_in_python_refuses_such_minutes_too(minutes: float) -> None:
     assert counter.steps == 0
 
 
-def test_clips_are_encoded_ahead_by_the_command(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_clips_are_encoded_ahead_by_the_command(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
     pytest.importorskip("diffusers", reason="no diffusers: pip install 'wiw[diffusers]'")
     pytest.importorskip("pyarrow", reason="no pyarrow: pip install 'wiw[export]'")
     from wiw.ray_cluster import Engine
@@ -145,4 +147,7 @@ def test_clips_are_encoded_ahead_by_the_command(tmp_path: Path, monkeypatch: pyt
     assert (named["workers"], named["place"], named["recipe"].frames) == (3, Engine(engine="ray"), 6)
     assert main([*asked, "--encode-only"]) == 2  # into which folder?
     assert main([*asked, "--workers", "3"]) == 2  # for --encode-only
+    for of_training in (["--dry-run"], ["--gpus", "2"], ["--out", "x"], ["--validation", "v"], ["--decisions", "d"]):
+        assert main([*asked, *cache, *of_training]) == 2
+        assert f"{of_training[0]}" in capsys.readouterr().err.splitlines()[-1]
     assert len(given) == 1

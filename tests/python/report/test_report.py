@@ -267,6 +267,14 @@ def test_plots_of_many_arms_have_room_for_their_names():
     assert heights[0] > 41 * 12 and heights[1] > 20 * 12 + 150 and heights[2] == pytest.approx(3.1 * 72)
 
 
+@pytest.mark.filterwarnings("error::UserWarning")
+def test_a_long_name_without_a_place_to_break_leaves_room_for_the_plot():
+    names = ["none", "m" * 200]
+    beside = success_by_arm(summarise(names, list_single(names), 1))
+    above = success_by_distance(list_ways(names, lambda i: 3.0 + i), Wording())
+    assert beside.count("m" * 28 + "<") >= 7 and above.count("m" * 30 + "<") >= 6
+
+
 def summary(wins, n=40, saved=0.0):
     outcomes = [
         {
@@ -288,6 +296,7 @@ def test_the_sentence_claims_no_more_than_the_interval_bears():
     assert "primitives" not in sentence(summary(1))
     assert "It took 2.0 fewer primitives" in sentence(summary(1, saved=2.0))
     assert sentence(summarise(["none"], [], 3)) == ""
+    assert "in 100.0 % of 1 episode," in sentence(summarise(["none", "warp"], list_single(["none", "warp"]), 1))
 
 
 def test_maps_put_world_points_in_their_place():

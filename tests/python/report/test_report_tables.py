@@ -107,3 +107,17 @@ def test_a_metric_that_one_arm_lacks_is_shown_of_the_others(width):
     assert "Grounded % ↑" in shown and "+100.0" in shown and "SPL" not in shown.partition("none:")[0]
     html = summary_html(found).partition("differences")[2]
     assert html.count('<td class="number">–</td>') == 1 and "Grounded, points" in html and "SPL, points" not in html
+
+
+def test_brackets_in_names_are_no_markup(terminal):
+    names = ["none", "svd[fps=7]", "copy", "[red]x", "oracle"]
+    rows = [
+        {"arm": arm, "episode": i, "scene": f"s{i}", "status": "done", "metrics": {"success": float(i % 2)}}
+        for arm in names
+        for i in range(4)
+    ]
+    shown = terminal(100, lambda: tables.print_summary(SummaryTable.of(summarise(names, rows, 4))))
+    listed = [line.split()[0] for line in shown.splitlines() if line.split()]
+    assert shown.count("svd[fps=7]") >= 3 and listed.count("svd[fps=7]") == listed.count("[red]x") >= 3
+    printed = terminal(100, lambda: tables.print_stacked("T[b]", ["a"], ["SR[i]"], [["1[u]"]], "arm[s]"))
+    assert printed.split()[:3] == ["T[b]", "arm[s]", "SR[i]"] and "1[u]" in printed

@@ -2,11 +2,15 @@
 from __future__ import annotations
 
 import ast
+import math
 from pathlib import Path
 from typing import Any
 
 import pytest
 from locations import ROOT
+
+from wiw.analysis.summary import show_utility
+from wiw.analysis.utility import Utility
 
 nbformat = pytest.importorskip("nbformat")
 
@@ -34,6 +38,12 @@ def set_parameters(notebook: Any, values: dict[str, Any]) -> None:
 
 def test_every_notebook_is_run() -> None:
     assert sorted(SIZES) == sorted(path.stem for path in FOLDER.glob("*.ipynb"))
+
+
+def test_a_notebook_says_of_a_utility_that_is_not_known_what_the_table_says() -> None:
+    shown = show_utility(Utility("warp", math.nan, math.nan, math.nan, 4, 2, False))
+    notebook = nbformat.read(FOLDER / "02_compare_world_models.ipynb", as_version=4)
+    assert any(f"the table says *{shown}*" in cell.source for cell in notebook.cells)
 
 
 @pytest.mark.slow

@@ -218,6 +218,30 @@ def test_servers_are_jobs_that_all_shards_ask(tmp_path, two_rooms, capsys):
         submit(tmp_path / "other", "--servers", 1, "--debug")
 
 
+def test_every_arm_of_the_served_model_asks_the_servers(tmp_path, capsys):
+    out = tmp_path / "run"
+    arms = "none,mine=warp?size=[36,64],reseeded:warp?size=[36,64],placebo-shuffled,heuristic+warp?size=[36,64]"
+    asked = ["imagenav", "--world-model", "warp", "--world-model-option", "size=[36,64]", "--arms", arms]
+    jobs = ["--shards", "1", "--servers", "1", "--dry-run", "--out", str(out)]
+    assert main(["submit", *asked, *jobs]) == 0
+    lines = [shlex.split(line)[1:] for line in capsys.readouterr().out.splitlines() if line.startswith("wiw ")]
+    served, run = f"remote:{out}/servers", lines[1]
+    assert run[run.index("--arms") + 1].split(",") == [
+        "none",
+        f"mine={served}",
+        f"reseeded:warp=reseeded:{served}",
+        "placebo-shuffled",
+        f"heuristic+warp=heuristic+{served}",
+        f"warp={served}",
+    ]
+    assert run[run.index("--world-model") + 1] == served and "--world-model-option" not in run
+
+
+def test_a_partition_of_no_servers_is_refused(tmp_path):
+    with pytest.raises(ArgumentError, match="--server-partition is for the jobs of --servers"):
+        submit(tmp_path / "run", "--server-partition", "gpu", "--debug")
+
+
 def test_servers_are_given_the_options_of_the_preset(tmp_path, capsys):
     pytest.importorskip("diffusers", reason="needs wiw[diffusers]")
     asked = ["imagenav", "--preset", "official", "--policy", "heuristic", "--revision", "matcher"]

@@ -11,7 +11,11 @@ import pytest
 from fakes import agent_for
 
 import wiw
+from wiw.action import FORWARD, TURN_LEFT, to_trajectory, to_viewpoints
 from wiw.errors import ArgumentError
+from wiw.types import Conditioning, Control
+from wiw.world_models.base import check_rollout
+from wiw.world_models.warp import Warp
 
 SIZE = (96, 96)
 
@@ -52,3 +56,18 @@ def test_manifests_name_view_and_size_only_where_they_are_chosen() -> None:
         assert small.describe()["size"] == (64, 128) and small.accepts.size == (64, 128)
     with pytest.raises(ArgumentError, match="expected front views"):
         wiw.world_model("oracle", space="pose7", view="panorama")
+
+
+def test_a_front_view_of_what_lies_behind_is_black_and_keeps_the_contract() -> None:
+    plan = np.array([FORWARD, *[TURN_LEFT] * 6], np.int8)
+    behind = Control(plan, to_trajectory(plan), to_viewpoints(plan), length=len(plan), shared=len(plan) - 1)
+    image = np.random.default_rng(0).integers(60, 200, (1, *SIZE, 3), np.uint8)
+    seen = Conditioning(image, depth=np.full((1, *SIZE), 2, np.float32))
+    frames = check_rollout(Warp("perspective", SIZE), seen, [behind], np.zeros(1, np.uint64))
+    assert not frames[0, -1].any()
+
+
+def test_a_chosen_size_or_view_draws_no_random_numbers_either() -> None:
+    for options in ({"view": "perspective"}, {"size": (64, 128)}):
+        for name in ("oracle", "warp"):
+            assert not wiw.world_model(name, **options).accepts.seeded

@@ -368,6 +368,10 @@ def test_weights_that_do_not_fit_are_named(weights: Path, tmp_path: Path, monkey
         NWM(weights=str(weights), vae=str(tmp_path / "nowhere"), device="cpu")
     with pytest.raises(ArgumentError, match="steps"):
         NWM(weights=str(weights), vae=vae, steps=1)
+    with pytest.raises(ArgumentError, match="revision: 'v2' is a revision of a hub repository"):
+        NWM(weights=str(weights), vae=vae, revision="v2", device="cpu")
+    with pytest.raises(ArgumentError, match="vae_revision: 'v2' is a revision of a hub repository"):
+        NWM(weights=str(weights), vae=vae, vae_revision="v2", device="cpu")
     with pytest.raises(ArgumentError, match="precision"):
         NWM(weights=str(weights), vae=vae, device="cpu", precision="int8")
     with pytest.raises(ArgumentError, match="got 'tpu9'"):

@@ -42,3 +42,21 @@ def test_the_end_of_a_plan_may_be_a_room_in_other_colours() -> None:
     frames[0, 1:] = end  # at once, after one action
     with pytest.raises(ContractError, match="after frame 0"):
         check_pictures("model", sample(seen[None]), frames, [make_control(ALL_FRAMES)])
+
+
+def test_frames_may_be_black_where_nothing_is_known_but_not_from_everywhere() -> None:
+    seen, other = draw(40, 5, 0), draw(40, 5, 1)
+    behind_a_wall = np.stack([seen, *[np.zeros_like(seen)] * 4])
+    for shared in (ALL_FRAMES, ENDS_ONLY):
+        check_pictures("model", sample(seen[None]), behind_a_wall[None], [make_control(shared)])
+    twice = np.stack([behind_a_wall] * 2)
+    check_pictures("model", sample(twice[:, 0]), twice, [make_control(ALL_FRAMES)] * 2)  # the same view
+    twice[1] = other
+    check_pictures("model", sample(twice[:, 0]), twice, [make_control(ALL_FRAMES)] * 2)
+    twice[1, 1:] = 0
+    with pytest.raises(ContractError, match="after frame 0, no value is above 1"):
+        check_pictures("model", sample(twice[:, 0]), twice, [make_control(ALL_FRAMES)] * 2)
+    ones = behind_a_wall.copy()
+    ones[1:] = 1
+    with pytest.raises(ContractError, match="after frame 0, no value is above 1"):  # as floats of a whole are cast
+        check_pictures("model", sample(seen[None]), ones[None], [make_control(ENDS_ONLY)])

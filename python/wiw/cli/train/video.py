@@ -71,6 +71,8 @@ def make_command(name: str) -> Callable[..., int]:
         numbers = drop_none({"epochs": epochs, "seed": seed or None})
         parts: dict[str, Any] = {"weights": weights, "device": device, "part": part}
         if encode_only:
+            unused = {"--out": out, "--validation": validation, "--decisions": decisions, "--tracker": tracker}
+            _require_encoding(unused, layout, dry_run)
             return _encode(name, data, cache, recipe, option, numbers, parts, workers or 1, place)
         if workers is not None or place != HERE:
             raise ArgumentError("train: --workers and --engine are for --encode-only; --gpus is for training")
@@ -194,6 +196,18 @@ def _train(name: str, data: Path, out: Path, recipe: PostTrainingRecipe, parts: 
             print(f"checkpoint  {out}")
             print(f"run it:     {_write_command(out, card['run'])}")
     return 0
+
+
+def _require_encoding(unused: Mapping[str, Any], layout: ProcessLayout, dry_run: bool) -> None:
+    """Refuse options of a training that encoding its clips does not read, `unused` and those of processes."""
+    given = [flag for flag, value in unused.items() if value is not None]
+    given += ["--gpus, --nodes or --partition"] if layout != ONE_PROCESS else []
+    given += ["--dry-run"] if dry_run else []
+    if given:
+        raise ArgumentError(
+            f"train: {given[0]} has no effect with --encode-only, which trains nothing; leave it out (--workers and "
+            "--engine say where clips are encoded)"
+        )
 
 
 def _encode(

@@ -14,7 +14,7 @@ from diffusers.models.autoencoders.autoencoder_kl import AutoencoderKL
 from safetensors.torch import save_file
 from torch import Tensor
 
-from wiw.errors import WeightsError
+from wiw.errors import ArgumentError, WeightsError
 from wiw.world_models.nwm.cdit import Architecture, CDiT
 from wiw.world_models.video.weights import explained, is_path
 
@@ -28,8 +28,10 @@ def fetch(weights: str, file: str, revision: str | None) -> Path:
 
     Raises:
         WeightsError: there is none; says what to do.
+        ArgumentError: a revision of a file or folder.
     """
     local = Path(weights).expanduser()
+    _refuse_revision("revision", revision, local)
     for found in (local / file, local / TRAINED, local):
         if found.is_file():
             return found
@@ -87,7 +89,9 @@ def load_codec(vae: str, revision: str | None) -> Any:
 
     Raises:
         WeightsError: the folder is empty, or the AutoencoderKL is incomplete.
+        ArgumentError: a revision of a folder.
     """
+    _refuse_revision("vae_revision", revision, Path(vae).expanduser())
     try:
         codec: Any = AutoencoderKL.from_pretrained(vae, revision=revision)
     except (OSError, ValueError, RuntimeError) as error:
@@ -99,6 +103,11 @@ def load_codec(vae: str, revision: str | None) -> Any:
     if lacking := [name for name, value in codec.named_parameters() if value.is_meta]:
         raise WeightsError(f"{vae} lacks {len(lacking)} parameters: {_list_some(lacking)}; fetch it again", "unfit")
     return codec.float().eval().requires_grad_(False)
+
+
+def _refuse_revision(option: str, revision: str | None, local: Path) -> None:
+    if revision is not None and local.exists():
+        raise ArgumentError(f"{option}: '{revision}' is a revision of a hub repository, but {local} is on this machine")
 
 
 def digest(*networks: torch.nn.Module) -> str:
