@@ -29,6 +29,7 @@ __all__ = [
     "TrainingError",
     "VlmError",
     "WeightsError",
+    "find_error_class",
     "find_raising_line",
     "is_stop_request",
 ]
@@ -50,6 +51,12 @@ def is_stop_request(error: BaseException) -> bool:
     """
     own = type(error).__module__.partition(".")[0] == "wiw" and not isinstance(error, Exception)
     return own or isinstance(error, KeyboardInterrupt)
+
+
+def find_error_class(name: str) -> type[Error] | None:
+    """Return the class of wiw's errors of that name, as another process reports it; None if there is none."""
+    found = globals().get(name) if name in __all__ else None
+    return found if isinstance(found, type) and issubclass(found, Error) else None
 
 
 def find_raising_line(error: BaseException) -> traceback.FrameSummary | None:

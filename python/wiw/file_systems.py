@@ -41,6 +41,11 @@ def find_network(path: Path) -> str | None:
     return found if found in NETWORK else None
 
 
+def choose_journal_mode(path: Path) -> str:
+    """Return the journal mode for an SQLite file of many writers at a path: WAL is safe on a local disk alone."""
+    return "DELETE" if find_network(path) else "WAL"
+
+
 def _unescape(text: str) -> str:
     r"""Return a path of the list of mounts, which has a space as \040."""
     return re.sub(r"\\([0-7]{3})", lambda code: chr(int(code.group(1), 8)), text)

@@ -102,7 +102,7 @@ def _draft(path: Path) -> Path:
 
 def _old(path: Path) -> Path:
     """Return where a replaced folder stays until the new one is in place."""
-    return path.with_name(f".{path.name}.old.{_place()}-{os.getpid()}.part")
+    return _draft(path.with_name(f"{path.name}.old"))
 
 
 @cache

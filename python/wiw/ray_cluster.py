@@ -17,8 +17,7 @@ from typing import Annotated, Any, Literal, TypeVar
 
 from tyro.conf import arg
 
-from wiw import errors
-from wiw.errors import ArgumentError, DependencyError, Error, InfrastructureError
+from wiw.errors import ArgumentError, DependencyError, Error, InfrastructureError, find_error_class
 
 Item = TypeVar("Item")
 STORE_BYTES = 200_000_000
@@ -217,8 +216,7 @@ def _find_cause(error: Any) -> Exception:
 
 def _remake_error(name: str, text: str) -> Error:
     """Return an error from the name of its class."""
-    kind = getattr(errors, name, InfrastructureError)
-    return kind(text) if isinstance(kind, type) and issubclass(kind, Error) else InfrastructureError(text)
+    return (find_error_class(name) or InfrastructureError)(text)
 
 
 def _restore(handler: Any) -> None:

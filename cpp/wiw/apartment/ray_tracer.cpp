@@ -34,21 +34,17 @@ RayTracer::~RayTracer() {
 
 namespace {
 
-struct Packet8 {
-  static constexpr std::size_t kSize = 8;
-  using Rays = RTCRay8;
-  using RayHits = RTCRayHit8;
-  static constexpr auto kOccluded = rtcOccluded8;
-  static constexpr auto kIntersect = rtcIntersect8;
+/// So many rays as Embree takes them, and its functions for them.
+template <std::size_t kRays, class RaysOfEmbree, class RayHitsOfEmbree, auto kOccludedOfEmbree, auto kIntersectOfEmbree>
+struct Packet {
+  static constexpr std::size_t kSize = kRays;
+  using Rays = RaysOfEmbree;
+  using RayHits = RayHitsOfEmbree;
+  static constexpr auto kOccluded = kOccludedOfEmbree;
+  static constexpr auto kIntersect = kIntersectOfEmbree;
 };
-
-struct Packet16 {
-  static constexpr std::size_t kSize = 16;
-  using Rays = RTCRay16;
-  using RayHits = RTCRayHit16;
-  static constexpr auto kOccluded = rtcOccluded16;
-  static constexpr auto kIntersect = rtcIntersect16;
-};
+using Packet8 = Packet<8, RTCRay8, RTCRayHit8, rtcOccluded8, rtcIntersect8>;
+using Packet16 = Packet<16, RTCRay16, RTCRayHit16, rtcOccluded16, rtcIntersect16>;
 
 /// Sets as many rays as a packet has, from the first-th direction on.
 template <class Packet>

@@ -59,7 +59,7 @@ class NavigationData(Sequence[NavigationSegment]):
         self.meta = read_meta(self.folder)
         """Camera, encoding, rules, scenes and checksums."""
         rows = read_segment_list(self.folder / SEGMENTS)
-        self.segments = [row for row in rows if part == "all" or part == part_of(strip_edits(row["scene"]), held_out)]
+        self.segments = [row for row in rows if part == "all" or part == part_of(row["scene"], held_out)]
         """Rows of `segments.parquet`: scene, file, row group, frames and action counts of each segment."""
         self._files: dict[str, FrameFile] = {}
 
@@ -184,8 +184,11 @@ class SelectedClips(Sequence[NavigationSegment]):
 
 
 def part_of(name: str, held_out: float) -> Literal["train", "held-out"]:
-    """Return the part that a scene or demonstration belongs to, by a hash of its name: adding some moves no other."""
-    number = int.from_bytes(blake2b(name.encode(), digest_size=8).digest(), "little")
+    """Return the part that a scene or demonstration belongs to, by a hash of its name: adding some moves no other.
+
+    An edited apartment belongs to the part of the one that it is a copy of.
+    """
+    number = int.from_bytes(blake2b(strip_edits(name).encode(), digest_size=8).digest(), "little")
     return "held-out" if number < held_out * 2**64 else "train"
 
 

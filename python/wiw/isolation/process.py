@@ -30,8 +30,7 @@ import msgpack
 import numpy as np
 from numpy.typing import NDArray
 
-from wiw import errors
-from wiw.errors import InfrastructureError
+from wiw.errors import InfrastructureError, find_error_class
 from wiw.isolation.connection import receive, send
 from wiw.isolation.failures import EndedError, ExitError, LateError, RaisedError
 from wiw.isolation.segments import SegmentPool, SharedSegment, place
@@ -291,8 +290,8 @@ def _build_error(message: Any) -> Exception:
     name, kind = str(message.get("type", "")), message.get("kind")
     if name == "ExitError":
         return ExitError(text)
-    own = getattr(errors, name, None) if name in errors.__all__ else None
-    if not (isinstance(own, type) and issubclass(own, errors.Error)):
+    own = find_error_class(name)
+    if own is None:
         return RaisedError(text)
     try:
         error: Exception = own(text, kind) if isinstance(kind, str) else own(text)

@@ -15,7 +15,7 @@ from pathlib import Path
 from typing import Any
 
 from wiw.errors import StoreError
-from wiw.file_systems import find_network
+from wiw.file_systems import choose_journal_mode
 
 FILE_NAME = "quality.sqlite"
 APPLICATION_ID = 0x77697771
@@ -97,8 +97,7 @@ class FrameScores:
         self.close()
 
     def _prepare(self) -> None:
-        log = "DELETE" if find_network(self.path) else "WAL"  # which is safe on a local disk alone
-        self._connection.execute(f"PRAGMA journal_mode = {log}")
+        self._connection.execute(f"PRAGMA journal_mode = {choose_journal_mode(self.path)}")
         self._connection.execute("PRAGMA synchronous = NORMAL")
         self._connection.execute("BEGIN IMMEDIATE")
         (tables,) = self._connection.execute("SELECT count(*) FROM sqlite_master").fetchone()

@@ -192,10 +192,8 @@ class AgentRecipe(AgentConfig):
             for name, own in self.policy_options.items()
         }
         named = self.model if isinstance(self.model, str) else ""
-        is_served = named in WORLD_MODELS.built_in or named.startswith(
-            "remote:"
-        )  # others may mean something else by it
-        options = _leave_out(self.model_options, "token") if is_served else self.model_options
+        is_own = named in WORLD_MODELS.built_in or named.startswith("remote:")  # others may mean something else by it
+        options = _leave_out(self.model_options, "token") if is_own else self.model_options
         return replace(self, policy_options=policies, model_options=options)
 
     @classmethod

@@ -31,10 +31,9 @@ class ScratchCopy:
 
     def __init__(self, home: Path, scratch: Path) -> None:
         own = home.expanduser().resolve()
-        scratch = find_local_folder() if str(scratch) == "auto" else scratch
         digest = blake2b(str(own).encode(), digest_size=6).hexdigest()
         self.home = home
-        self.path = scratch.expanduser().resolve() / f"{own.parent.name}-{digest}" / own.name
+        self.path = choose_local_folder(scratch).expanduser().resolve() / f"{own.parent.name}-{digest}" / own.name
         self._copied = time.monotonic()
 
     def fetch_store(self) -> None:
@@ -95,19 +94,22 @@ class ScratchCopy:
         return begun_here == begun and ended_here > ended
 
 
-def find_local_folder() -> Path:
-    """Return where temporary files belong: the folder of the SLURM job where the cluster makes one, else $TMPDIR."""
-    return Path(os.environ.get("SLURM_TMPDIR") or tempfile.gettempdir())
+def choose_local_folder(given: str | Path) -> Path:
+    """Return the given folder; of "auto", where temporary files belong.
+
+    That is the folder of the SLURM job where the cluster makes one, else $TMPDIR.
+    """
+    return Path(os.environ.get("SLURM_TMPDIR") or tempfile.gettempdir()) if str(given) == "auto" else Path(given)
 
 
 @contextmanager
 def make_local_folder(parent: str | Path | None) -> Iterator[Path]:
-    """Yield a new folder that is removed at the end, in `parent`; without one, or "auto", where temporary files belong.
+    """Yield a new folder that is removed at the end, in `parent`, by default that of "auto" (`choose_local_folder`).
 
     Raises:
         FileError: it cannot be made.
     """
-    own = find_local_folder() if parent is None or str(parent) == "auto" else Path(parent)
+    own = choose_local_folder("auto" if parent is None else parent)
     try:
         own.mkdir(parents=True, exist_ok=True)
         folder = tempfile.TemporaryDirectory(prefix="wiw-", dir=own)

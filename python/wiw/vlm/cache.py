@@ -19,7 +19,7 @@ from pathlib import Path
 from typing import Any
 
 from wiw.errors import ArgumentError
-from wiw.file_systems import find_network
+from wiw.file_systems import choose_journal_mode
 from wiw.vlm.messages import Completion
 
 _log = logging.getLogger("wiw.vlm")
@@ -92,8 +92,7 @@ class ReplyCache:
     def _open(self) -> sqlite3.Connection:
         if self._connection is None or self._process != os.getpid():
             connection = sqlite3.connect(self.folder / "replies.sqlite", timeout=30, check_same_thread=False)
-            log = "DELETE" if find_network(self.folder) else "WAL"  # which is safe on a local disk alone
-            connection.execute(f"PRAGMA journal_mode = {log}")
+            connection.execute(f"PRAGMA journal_mode = {choose_journal_mode(self.folder)}")
             connection.execute("PRAGMA synchronous = NORMAL")
             connection.execute(_SCHEMA)
             self._connection, self._process = connection, os.getpid()
