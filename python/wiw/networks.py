@@ -36,6 +36,13 @@ def resolve_device(name: str | None) -> str:
     return name
 
 
+def describe_device(device: str) -> str:
+    """Return the name of a device's hardware where that matters: of a GPU."""
+    import torch
+
+    return torch.cuda.get_device_name(device) if device.startswith("cuda") else device
+
+
 def has_bfloat16() -> bool:
     """Return whether the CPU has instructions for products in bfloat16; without them, float32 is faster."""
     import torch

@@ -70,7 +70,7 @@ class WeightFile(Generic[N]):
             FileError: the file cannot be written.
         """
         header = {**self.sizes(network), "card": dict(card)}
-        values = {name: value.half().contiguous() for name, value in network.state_dict().items()}
+        values = {name: value.half().cpu().contiguous() for name, value in network.state_dict().items()}
         metadata = {"format": self.format, "header": json.dumps(header, sort_keys=True), "digest": digest(values)}
         with atomic_file(path) as draft:
             draft.write_bytes(packed(values, metadata))

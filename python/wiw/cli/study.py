@@ -26,6 +26,7 @@ def study_data_scaling(
     decisions_per_scene: Annotated[int | None, arg(metavar="N")] = None,
     imagenav: Annotated[int, arg(metavar="EPISODES")] = 0,
     workers: Annotated[int, arg(metavar="N")] = 1,
+    device: Annotated[str | None, arg(metavar="DEVICE", help_behavior_hint="")] = None,
 ) -> int:
     """Does a world model improve with data, or with updates? Train small models on nested subsets of a dataset.
 
@@ -59,6 +60,8 @@ def study_data_scaling(
         decisions_per_scene: Decisions per scene, fewer if there is no room. Default: 30.
         imagenav: Episodes of ImageNav in which to run the first seed's models as well; 0 for none.
         workers: Number of processes, each with one thread; results do not depend on it.
+        device: Where to train: cpu, cuda, cuda:1, ... Default: the GPU if there is one, which all workers share. Models
+            are evaluated on the CPU.
     """
     from dataclasses import replace
 
@@ -83,7 +86,7 @@ def study_data_scaling(
     lists = {name: tuple(value) for name, value in changes.items() if isinstance(value, list)}
     settings = replace(SMALL if small else FULL, **changes | lists)
     with announce_resume(), Bars() as bars:
-        found = data_scaling(data, out, settings, workers=workers, episodes=imagenav, watch=bars.show)
+        found = data_scaling(data, out, settings, workers=workers, episodes=imagenav, device=device, watch=bars.show)
     found.summary()
     for path in found.save():
         print(path)

@@ -23,6 +23,7 @@ from wiw.datasets.navigation import NavigationData
 from wiw.datasets.scene_splits import name_scene
 from wiw.errors import ArgumentError, FileError
 from wiw.files import atomic_file
+from wiw.networks import resolve_device
 from wiw.scenes import resolve, strip_edits
 from wiw.studies.data_scaling_plan import (
     FULL,
@@ -95,6 +96,7 @@ def data_scaling(
     *,
     workers: int = 1,
     episodes: int = 0,
+    device: str | None = None,
     watch: Watch = lambda *_: None,
 ) -> DataScaling:
     """Train small world models on nested subsets of a dataset, evaluate them, and split the gain into data and updates.
@@ -110,13 +112,14 @@ def data_scaling(
             `out`.
         out: folder of the study.
         settings: sizes, models, seeds and what is measured; `wiw.studies.data_scaling_plan.SMALL` is the small version.
-        workers: number of processes, each with one thread.
+        workers: number of processes, each with one thread of the CPU.
         episodes: episodes of ImageNav in which to run the first seed's models as well; 0 for none.
+        device: of torch, for training; "cuda" if there is one, else "cpu". Several workers share it.
         watch: called with progress.
 
     Raises:
-        ArgumentError: a number out of range, a dataset with too few clips or scenes, a folder with another study, or
-            several processes of torchrun.
+        ArgumentError: a number out of range, no such device, a dataset with too few clips or scenes, a folder with
+            another study, or several processes of torchrun.
         DependencyError: torch or pyarrow is not installed.
         FileError: the dataset is missing or damaged, or a file cannot be written.
         InfrastructureError: a worker process has died.
@@ -135,12 +138,13 @@ def data_scaling(
     for name in settings.models:  # fails before anything takes time
         create_recipe(make_learner(name), settings, settings.clips, 0)
     resolve(settings.decision_scenes)
+    where = resolve_device(device)
     folder = Path(out)
     source = Path(data) if data is not None else _collect(folder, workers, watch)
     plan = make_plan(source, settings)
     write_plan(plan, folder)
     _prepare(plan, source, folder, watch)
-    jobs = [TrainingJob(training, plan, source, folder) for training in plan.list_trainings()]
+    jobs = [TrainingJob(training, plan, source, folder, where) for training in plan.list_trainings()]
     measures = _run_trainings(jobs, workers, watch)
     material = load_material(source, folder, settings)
     references = measure_references(material.held_out, material.decisions)

@@ -18,7 +18,7 @@ from wiw.datasets.decisions import Decisions, load_decisions
 from wiw.datasets.navigation import Clips, NavigationData, SelectedClips
 from wiw.errors import FileError
 from wiw.files import atomic_file
-from wiw.networks import single_thread
+from wiw.networks import describe_device, single_thread
 from wiw.studies.data_scaling_plan import STEP, ScalingPlan, ScalingSettings, Training
 from wiw.training.decision_errors import DecisionErrors, measure_decisions
 from wiw.training.held_out_clips import Frames, Imagine, imagine_with, measure_clips
@@ -91,6 +91,8 @@ class TrainingJob:
     plan: ScalingPlan
     data: Path
     folder: Path
+    device: str = "cpu"
+    """Of torch, for the training; the model is measured on the CPU."""
 
     @property
     def weights(self) -> Path:
@@ -124,7 +126,12 @@ class TrainingJob:
                 self._train(material)
             model = learner.model(self.weights)
             measures = measure(imagine_with(model), material.held_out, material.decisions)
-        found = {**self._card, "seconds": time.monotonic() - began, "measures": measures}
+        found = {
+            **self._card,
+            "seconds": time.monotonic() - began,
+            "device": describe_device(self.device),
+            "measures": measures,
+        }
         with atomic_file(self._measures) as draft:
             draft.write_text(json.dumps(found) + "\n", encoding="utf-8")
         return measures
@@ -139,7 +146,7 @@ class TrainingJob:
         rows = material.select_rows(own).tolist()
         checkpoint = Checkpoint(self.weights.with_suffix(".checkpoint"), self._card, SAVED_EVERY)
         trainer, _ = run_training(
-            lambda: learner.trainer(SelectedClips(material.clips, rows), material.frames, recipe),
+            lambda: learner.trainer(SelectedClips(material.clips, rows), material.frames, recipe, self.device),
             recipe,
             own.updates,
             None,

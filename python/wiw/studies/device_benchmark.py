@@ -281,12 +281,12 @@ def measure_network(name: str, batch: int, device: str, label: str, seconds: flo
     import torch
 
     from wiw.networks import single_thread
-    from wiw.studies.network_cases import compute_loss, list_cases, use_device
+    from wiw.studies.network_cases import compute_loss, list_cases
 
     case = list_cases()[name]
-    with use_device("cpu"):
+    with torch.device("cpu"):
         network = case.make().to(device)
-    with use_device(device), single_thread():  # as rollouts on the CPU are computed
+    with torch.device(device), single_thread():  # as rollouts on the CPU are computed
         torch.manual_seed(0)
         inputs = case.draw(network, batch)
         wait = torch.cuda.synchronize if device.startswith("cuda") else lambda: None

@@ -7,8 +7,7 @@ square of what it returns as the loss, its gradient, and a step of AdamW: what t
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from collections.abc import Callable
 from dataclasses import dataclass, fields, is_dataclass
 from typing import Any
 
@@ -51,27 +50,6 @@ def compute_loss(case: NetworkCase, network: nn.Module, inputs: Inputs) -> Tenso
     """Return the mean square of all floating-point tensors that one pass returns."""
     found = [value.float().square().mean() for value in _list_tensors(case.call(network, *inputs))]
     return torch.stack(found).mean()
-
-
-@contextmanager
-def use_device(device: str) -> Iterator[None]:
-    """Make all tensors on a device, as long as the context lasts.
-
-    The networks keep maps of directions from their first call on, which are dropped before and after: they are of one
-    device.
-    """
-    from wiw.world_models.pocket import network as pocket
-    from wiw.world_models.warpnet import network as warpnet
-
-    maps: tuple[Any, ...] = (warpnet.rays, warpnet.plain_room, pocket._headings)
-    for each in maps:
-        each.cache_clear()
-    try:
-        with torch.device(device):
-            yield
-    finally:
-        for each in maps:
-            each.cache_clear()
 
 
 def _list_tensors(value: Any) -> list[Tensor]:

@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 from torch import Tensor, nn
 
 from wiw.datasets.navigation import Clips, NavigationData, SelectedClips
+from wiw.networks import has_bfloat16
 from wiw.training.post_training.clip_trainer import ClipTrainer, mix_seed, seed_torch
 from wiw.training.post_training.recipe import ClipRecipe
 from wiw.training.reduced_frames import ReducedFrames
@@ -24,6 +25,7 @@ class PlaceTrainer(ClipTrainer):
         clips: what is trained on.
         frames: of the same dataset, in the recipe's size.
         recipe: of the training.
+        device: of torch, where the network is trained.
 
     Raises:
         ArgumentError: there are fewer clips than one step takes.
@@ -32,11 +34,13 @@ class PlaceTrainer(ClipTrainer):
     clips: Clips | SelectedClips
     network: nn.Module
 
-    def __init__(self, clips: Clips | SelectedClips, frames: ReducedFrames, recipe: ClipRecipe) -> None:
-        super().__init__(clips, recipe, torch.device("cpu"))
+    def __init__(
+        self, clips: Clips | SelectedClips, frames: ReducedFrames, recipe: ClipRecipe, device: str = "cpu"
+    ) -> None:
+        super().__init__(clips, recipe, torch.device(device))
         self.frames = frames
         with seed_torch(mix_seed(recipe.seed, "weights"), self.device):
-            self.network = self.create_network().train()
+            self.network = self.create_network().train().to(self.device)
         self.start_optimizer(dict(self.network.named_parameters()))
 
     @classmethod
@@ -56,6 +60,12 @@ class PlaceTrainer(ClipTrainer):
         self, clips: Sequence[NDArray[np.int64]], rng: np.random.Generator, random: torch.Generator
     ) -> Tensor:
         """Return the loss of each clip, given as its panoramas in order; both generators are of this step alone."""
+
+    def reduce_precision(self) -> torch.autocast:
+        """Return a context that computes products in bfloat16, if the recipe says so and it is faster on the device."""
+        kind = self.device.type
+        wanted = self.recipe.precision == "bfloat16" and (kind != "cpu" or has_bfloat16())
+        return torch.autocast(kind, torch.bfloat16, enabled=wanted)
 
     def compute_losses(self, rows: NDArray[np.int64], random: torch.Generator) -> Tensor:
         """Return the loss of each clip."""

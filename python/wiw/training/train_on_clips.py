@@ -3,6 +3,7 @@
 
 from __future__ import annotations
 
+import copy
 import json
 import shutil
 from collections.abc import Callable, Mapping
@@ -16,7 +17,7 @@ import wiw
 from wiw.datasets.navigation import NavigationData, Part
 from wiw.errors import WeightsError
 from wiw.files import atomic_file
-from wiw.networks import memory_guard
+from wiw.networks import describe_device, memory_guard, resolve_device
 from wiw.training.held_out_clips import Frames, Imagine, imagine_with
 from wiw.training.learners import Learner, make_learner
 from wiw.training.place_trainer import PlaceTrainer
@@ -49,6 +50,7 @@ def train_on_clips(
     validation: str | Path | None = None,
     decisions: str | Path | None = None,
     tracker: str | None = None,
+    device: str | None = None,
     seconds: float = 600.0,
     on_step: Callable[[int, int, float], None] = lambda *_: None,
     on_validation: OnValidation = lambda *_: None,
@@ -57,7 +59,8 @@ def train_on_clips(
     """Train, or resume, and write the file of weights: the best in validation, or the last without it.
 
     A state is kept beside `out`, in `OUT.checkpoint`, every so often, at SIGUSR1, and before the process stops at
-    SIGTERM or Ctrl-C. The same call resumes from it; with the same number of threads it ends with the same bytes.
+    SIGTERM or Ctrl-C. The same call resumes from it; on the CPU, with the same number of threads, it ends with the same
+    bytes.
     Once it has written `out`, it returns that file's card, until the weights are measured (`held_out` in the card).
     `OUT.log` has the loss of each step and what validations found.
 
@@ -71,6 +74,7 @@ def train_on_clips(
         validation: folder of another dataset whose clips it is validated on; the scenes left out if None.
         decisions: file of `wiw collect decisions`, for the rank agreement with the oracle.
         tracker: "trackio", "wandb" or "tensorboard", which receives the log.
+        device: of torch, for training; "cuda" if there is one, else "cpu". Models imagine on the CPU in any case.
         seconds: least time between two writes of the state.
         on_step: called after each step with its number, the number of all steps and a running mean of the loss.
         on_validation: called after each validation with the number of steps done and what was found.
@@ -80,15 +84,15 @@ def train_on_clips(
         The card in the file: data, recipe, steps, validation and the loss at the end.
 
     Raises:
-        ArgumentError: an unknown model; a dataset of perspective views, of scenes for evaluation or, for warpnet,
-            without depth; too few clips; a state of a training with other data or numbers; or validation on scenes
-            that are trained on or not there.
+        ArgumentError: an unknown model or device; a dataset of perspective views, of scenes for evaluation or, for
+            warpnet, without depth; too few clips; a state of a training with other data or numbers; or validation on
+            scenes that are trained on or not there.
         TrainingError: the loss is not finite; the last good state is kept, the message names the batch.
         FileError: the dataset is missing or damaged, or a file cannot be written.
         DeviceMemoryError: memory does not suffice.
         DependencyError: torch or safetensors is not installed.
     """
-    learner = make_learner(name)
+    learner, device = make_learner(name), resolve_device(device)
 
     def open_part(folder: str | Path, wanted: Part) -> NavigationCorpus:
         found = NavigationCorpus(NavigationData(folder, wanted, recipe.held_out), wanted)
@@ -109,9 +113,10 @@ def train_on_clips(
     card |= {"validated_on": checked.identity if checked else None}
     if (finished := _read_finished(learner, out, card)) is not None:
         return finished
-    trainer = learner.trainer(clips, reduce_frames(dataset, recipe.clip_size, cache, bar), recipe)
+    trainer = learner.trainer(clips, reduce_frames(dataset, recipe.clip_size, cache, bar), recipe, device)
     state = SignalledCheckpoint(out.with_name(f"{out.name}.checkpoint"), {"model": name, **card}, seconds)
-    with memory_guard(f"training {name}", f"lower batch (now {recipe.batch}), or choose a smaller size or network"):
+    remedies = f"lower batch (now {recipe.batch}), or choose a smaller size or network"
+    with memory_guard(f"training {name} on {device}", remedies):
         validated = train_and_validate(
             trainer,
             create_sampler(learner, trainer),
@@ -123,26 +128,23 @@ def train_on_clips(
             on_step,
             on_validation,
         )
-    card |= {"trained_steps": trainer.step_count, "loss": trainer.mean_loss}
+    card |= {"trained_steps": trainer.step_count, "loss": trainer.mean_loss, "device": describe_device(device)}
     card = _publish_weights(learner, out, validated, trainer, card)
     state.remove()
     return card
 
 
 def create_sampler(learner: Learner, trainer: PlaceTrainer) -> Imagine:
-    """Return how the network in training imagines, with its averaged weights if there are any."""
-    imagine = imagine_with(learner.model.of(trainer.network))
-    trainer.network.train()
+    """Return how the network in training imagines on the CPU, with its averaged weights if there are any."""
+    shown = copy.deepcopy(trainer.network).cpu()
+    imagine = imagine_with(learner.model.of(shown))
 
     def imagine_now(
         observations: Conditioning, plans: NDArray[Any], seeds: NDArray[np.uint64], wanted: NDArray[np.int64]
     ) -> Frames:
         with trainer.use_averages():
-            trainer.network.eval()
-            try:
-                return imagine(observations, plans, seeds, wanted)
-            finally:
-                trainer.network.train()
+            shown.load_state_dict(trainer.network.state_dict())
+        return imagine(observations, plans, seeds, wanted)
 
     return imagine_now
 

@@ -4,7 +4,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, fields
 from pathlib import Path
 from typing import Any
 
@@ -155,6 +155,10 @@ class Pairs:
     log_distance: Tensor
     """[B, 1, H, W] of the target."""
 
+    def to(self, device: torch.device) -> Pairs:
+        """Return the pairs on a device."""
+        return Pairs(*(getattr(self, field.name).to(device) for field in fields(self)))
+
 
 def sample_pairs(walks: Walks, count: int, rng: np.random.Generator) -> Pairs:
     """Sample pairs of panoramas of a walk, in either direction."""
@@ -205,8 +209,8 @@ def _augment_panoramas(panoramas: NDArray[Any], back: NDArray[np.bool_], mirrore
 
 def compute_losses(found: Prediction, pairs: Pairs, recipe: Recipe) -> Tensor:
     """Return the loss of each pair, float32 [B]."""
-    height = pairs.target.shape[2]
-    weights = torch.cos(torch.pi * ((torch.arange(height) + 0.5) / height - 0.5))[:, None]
+    height, device = pairs.target.shape[2], pairs.target.device
+    weights = torch.cos(torch.pi * ((torch.arange(height, device=device) + 0.5) / height - 0.5))[:, None]
 
     def average(values: Tensor, weights: Tensor) -> Tensor:
         return (values * weights).mean(dim=(1, 2, 3))

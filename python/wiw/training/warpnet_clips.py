@@ -17,7 +17,6 @@ from torch import Tensor
 
 from wiw.datasets.navigation import NavigationData
 from wiw.errors import ArgumentError
-from wiw.networks import has_bfloat16
 from wiw.training.held_out_panoramas import turn_panoramas
 from wiw.training.place_trainer import PlaceTrainer
 from wiw.training.pocket.batches import draw_places
@@ -74,8 +73,8 @@ class WarpNetClipTrainer(PlaceTrainer):
         self, clips: Sequence[NDArray[np.int64]], rng: np.random.Generator, random: torch.Generator
     ) -> Tensor:
         """Return the loss of each clip."""
-        pairs = draw_pairs(self.frames, clips, rng)
-        with torch.autocast("cpu", torch.bfloat16, enabled=self.recipe.precision == "bfloat16" and has_bfloat16()):
+        pairs = draw_pairs(self.frames, clips, rng).to(self.device)
+        with self.reduce_precision():
             found = self.network(pairs.source, pairs.ahead)
         return compute_losses(found, pairs, Recipe())
 

@@ -19,7 +19,7 @@ from wiw.studies.device_benchmark import SHRINK, SIZES, Measurement
 
 torch = pytest.importorskip("torch", reason="needs torch: pip install 'wiw[torch]'")
 
-from wiw.studies.network_cases import compute_loss, list_cases, use_device  # noqa: E402
+from wiw.studies.network_cases import compute_loss, list_cases  # noqa: E402
 
 pytestmark = pytest.mark.usefixtures("one_torch_thread")
 NETWORKS = ("warpnet", "armnet", "navigator", "recogniser", "perception", "pocket", "diffuser")
@@ -46,7 +46,7 @@ def test_a_training_step_reaches_all_weights_that_a_rollout_uses(name: str) -> N
     """The gradient of the loss is finite, and reaches nearly every parameter: the whole network is measured."""
     case = list_cases()[name]
     torch.manual_seed(0)
-    with use_device("cpu"):
+    with torch.device("cpu"):
         network = case.make().train()
         compute_loss(case, network, case.draw(network, 2)).backward()
     reached = {key for key, value in network.named_parameters() if value.grad is not None}
@@ -59,14 +59,14 @@ def test_networks_make_all_that_they_need_on_the_device(monkeypatch: pytest.Monk
     monkeypatch.setattr("wiw.world_models.warpnet.network._log", math.log)  # a number of Python: it needs data
     for name in ("warpnet", "armnet", "navigator", "perception", "pocket"):
         case = list_cases()[name]
-        with use_device("cpu"):
+        with torch.device("cpu"):
             network = case.make()
-        with use_device("meta"):
+        with torch.device("meta"):
             found = (case.roll_out or case.call)(network.to("meta"), *case.draw(network, 1))
         assert found is not None
     from wiw.world_models.warpnet.network import rays
 
-    assert rays(8, 16).device.type == "cpu"  # no map of the other device is left behind
+    assert rays(8, 16).device.type == "cpu"  # maps are kept for each device
 
 
 def test_views_are_drawn_in_small_sizes_without_a_gpu(

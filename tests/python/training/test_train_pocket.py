@@ -4,7 +4,9 @@
 from __future__ import annotations
 
 import json
+import math
 import shutil
+from contextlib import nullcontext
 from pathlib import Path
 from typing import Any
 
@@ -22,6 +24,7 @@ torch = pytest.importorskip("torch", reason="needs wiw[torch]")
 from wiw.training.held_out_clips import imagine_with  # noqa: E402
 from wiw.training.held_out_panoramas import select_panoramas  # noqa: E402
 from wiw.training.learners import make_learner  # noqa: E402
+from wiw.training.place_trainer import PlaceTrainer  # noqa: E402
 from wiw.training.pocket.batches import compute_displacements, draw_batch, draw_places  # noqa: E402
 from wiw.training.pocket.held_out import BASELINES, draw_windows, measure, shuffle_places  # noqa: E402
 from wiw.training.pocket.recipe import PocketRecipe  # noqa: E402
@@ -99,6 +102,32 @@ def test_with_the_true_distances_a_batch_is_the_warp_of_its_source(frames: Reduc
     error = average_sphere((made - batch.views).abs())
     still = average_sphere((batch.source[:, None] - batch.views).abs())
     assert (error < 0.75 * still).all() and error.mean() < 0.5 * still.mean()
+
+
+@pytest.mark.parametrize("name", ["pocket", "warpnet"])
+def test_a_step_is_computed_on_the_trainers_device(
+    name: str, dataset: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """On a device without data a tensor that is left on the CPU is an error, as on a GPU."""
+    monkeypatch.setattr("wiw.world_models.warpnet.network._log", math.log)  # a number of Python: it needs data
+    monkeypatch.setattr(PlaceTrainer, "reduce_precision", nullcontext)  # which torch has on real devices alone
+    data, learner = NavigationData(dataset), make_learner(name)
+    chosen = learner.create_recipe(frames=8, size=SIZE, batch=2, clips=2, seed=0)
+    made = learner.trainer(data.clips(8), reduce_frames(data, SIZE, tmp_path), chosen, "meta")
+    losses = made.compute_losses(np.arange(2), torch.Generator().manual_seed(0))
+    assert losses.device.type == "meta" and losses.shape == (2,)
+    losses.sum().backward()
+    assert all(value.device.type == "meta" for value in made.network.parameters())
+
+
+@pytest.mark.skipif(torch.cuda.is_available(), reason="needs a machine without a GPU")
+def test_a_device_that_is_not_there_is_refused_before_anything_is_written(
+    dataset: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    given = ["train", "pocket", "--data", str(dataset), "--part", "all", "--out", str(tmp_path / "out")]
+    assert main([*given, "--device", "cuda:1", "--cache", str(tmp_path / "cache")]) == 2
+    assert "there is no 'cuda:1'" in capsys.readouterr().err
+    assert not list(tmp_path.iterdir())
 
 
 def test_displacements_are_right_and_ahead_of_who_faces_there() -> None:

@@ -34,7 +34,7 @@ def train_and_measure(
         cache: folder for prepared frames.
         val: held-out scenes.
         recipe: the numbers.
-        watched: `part`, `validation`, `decisions` and `tracker` of `wiw.training.train_on_clips`.
+        watched: `part`, `validation`, `decisions`, `tracker` and `device` of `wiw.training.train_on_clips`.
         evaluate: measures a world model, given it, the scenes, a seed and `bar`.
 
     Raises:

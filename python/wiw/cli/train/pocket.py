@@ -27,6 +27,7 @@ def train_pocket(
     validation: Annotated[Path | None, arg(metavar="DIR", help_behavior_hint="")] = None,
     decisions: Annotated[Path | None, arg(metavar="FILE", help_behavior_hint="")] = None,
     tracker: TrackerName | None = None,
+    device: Annotated[str | None, arg(metavar="DEVICE", help_behavior_hint="")] = None,
     epochs: Count = None,
     seed: Annotated[int, arg(metavar="N")] = 0,
     cache: Annotated[Path | None, arg(metavar="DIR", help_behavior_hint="")] = None,
@@ -39,10 +40,10 @@ def train_pocket(
     $ wiw train pocket --data data --option clips=1600 --out short.safetensors
     $ wiw run imagenav --world-model pocket --world-model-option weights=pocket.safetensors
 
-    Training takes two to three hours on two idle cores, less with --option clips=N. Repeat an interrupted command to
-    resume it; SIGUSR1 writes the checkpoint at once. FILE also holds the recipe, PSNR on windows of the val scenes,
-    next to baselines without learning, and how much of it is lost when given another window's places. The weights
-    shipped with wiw were trained on 16 800 clips.
+    Training takes two to three hours on two idle cores, minutes on a GPU, less with --option clips=N. Repeat an
+    interrupted command to resume it; SIGUSR1 writes the checkpoint at once. FILE also holds the recipe, PSNR on windows
+    of the val scenes, next to baselines without learning, and how much of it is lost when given another window's
+    places. The weights shipped with wiw were trained on 16 800 clips.
 
     Args:
         data: Dataset of `wiw collect navigation`.
@@ -58,6 +59,7 @@ def train_pocket(
             the plans agrees with the true one.
         tracker: Experiment tracker that plots loss and validation; requires its package. OUT.log/metrics.jsonl has the
             same data in any case.
+        device: Where to train: cpu, cuda, cuda:1, ... Default: the GPU if there is one.
         epochs: Number of epochs: how often each clip is used, on average. Default: 1.
         seed: Seed of the order of clips and of the weights.
         cache: Folder for prepared training data, which can be deleted at any time. Default: $WIW_CACHE/looks.
@@ -77,6 +79,7 @@ def train_pocket(
         options = {**numbers, **parse_options(option, PocketRecipe, "--option")}
         chosen = load_recipe("pocket", recipe, options, kind=PocketRecipe)
         watched = {"part": part, "validation": validation, "decisions": decisions, "tracker": tracker}
+        watched |= {"device": device}
         folder = require_data("pocket", data)
         card = train_and_measure(
             "pocket", out, folder, Preparation(cache=cache).folder, val, chosen, watched, held_out.evaluate

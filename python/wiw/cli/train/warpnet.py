@@ -33,6 +33,7 @@ def train_warpnet(
     option: Options = (),
     part: Literal["train", "all"] = "train",
     validation: Annotated[Path | None, arg(metavar="DIR", help_behavior_hint="")] = None,
+    device: Annotated[str | None, arg(metavar="DEVICE", help_behavior_hint="")] = None,
     preparation: Annotated[Preparation, arg(name="")] = PREPARATION,
 ) -> int:
     """Train warpnet, a world model for navigation that predicts the panorama seen from a place nearby.
@@ -59,6 +60,7 @@ def train_warpnet(
             `wiw.training.warpnet_clips.WarpNetClipRecipe`.
         part: With --data: the part to train on; train holds out one in twenty scenes for validation.
         validation: With --data: another dataset, with other scenes, for validation. Default: the scenes held out.
+        device: With --data: where to train: cpu, cuda, cuda:1, ... Default: the GPU if there is one.
         limits: Time limit and seed.
         preparation: How training data is prepared.
     """
@@ -67,7 +69,7 @@ def train_warpnet(
 
     check_counts(places=places, epochs=epochs)
     require(WarpNet.requires)
-    watched = {"part": part, "validation": validation}
+    watched = {"part": part, "validation": validation, "device": device}
     _check_source(data, scenes, places, limits, option, watched, preparation)
     with write_weights("warpnet", out):
         if data is not None:
@@ -102,6 +104,7 @@ def _check_source(
             "--option": bool(option),
             "--part": watched["part"] != "train",
             "--validation": watched["validation"] is not None,
+            "--device": watched["device"] is not None,
         }
         source = "walks; they go with --data"
     else:

@@ -29,6 +29,11 @@ class PlaceBatch:
     log_distances: Tensor | None
     """[B, F, 1, H, W] of the views; None if the dataset has no depth."""
 
+    def to(self, device: torch.device) -> PlaceBatch:
+        """Return the batch on a device."""
+        distances = None if self.log_distances is None else self.log_distances.to(device)
+        return PlaceBatch(self.source.to(device), self.places.to(device), self.views.to(device), distances)
+
 
 def draw_batch(
     frames: ReducedFrames, clips: Sequence[NDArray[np.int64]], count: int, rng: np.random.Generator

@@ -10,7 +10,6 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from wiw.networks import has_bfloat16
 from wiw.training.place_trainer import PlaceTrainer
 from wiw.training.pocket.batches import PlaceBatch, draw_batch
 from wiw.training.pocket.recipe import PocketRecipe
@@ -35,13 +34,14 @@ class PocketTrainer(PlaceTrainer):
         return self._compute_losses(draw_batch(self.frames, clips, self.recipe.places, rng), random)
 
     def _compute_losses(self, batch: PlaceBatch, random: torch.Generator) -> Tensor:
-        recipe = self.recipe
+        recipe, batch = self.recipe, batch.to(self.device)
         levels = draw_shifted_uniform(len(batch.source), recipe.shift, random)
         levels[torch.rand(len(levels), generator=random) < recipe.pure_noise] = 1
-        noise = torch.randn(batch.views.shape, generator=random)
+        noise = torch.randn(batch.views.shape, generator=random).to(self.device)
+        levels = levels.to(self.device)
         noisy = torch.lerp(batch.views, noise, levels[:, None, None, None, None])
         views = Views.around(batch.source, batch.places)
-        with torch.autocast("cpu", torch.bfloat16, enabled=recipe.precision == "bfloat16" and has_bfloat16()):
+        with self.reduce_precision():
             estimate = self.network(noisy, levels, views.sweep, batch.places)
         errors = measure_errors(views.blend(estimate) - batch.views, recipe)
         if batch.log_distances is not None and recipe.distance:
@@ -58,5 +58,5 @@ def measure_errors(difference: Tensor, recipe: PocketRecipe) -> Tensor:
 def average_sphere(values: Tensor) -> Tensor:
     """Return means [B] of panoramas [B, F, C, H, W], in which pixels count as the area that they cover."""
     height = values.shape[-2]
-    areas = torch.cos(torch.pi * ((torch.arange(height) + 0.5) / height - 0.5))
+    areas = torch.cos(torch.pi * ((torch.arange(height, device=values.device) + 0.5) / height - 0.5))
     return (values.mean(dim=(1, 2, 4)) * areas).sum(dim=1) / areas.sum()

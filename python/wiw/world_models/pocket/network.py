@@ -68,7 +68,8 @@ class Views:
         size, count = source.shape[-2:], places.shape[:2].numel()
         right, ahead = places.flatten(0, 1).unbind(dim=1)
         repeated = source.repeat_interleave(places.shape[1], dim=0)
-        warps = [warp(repeated, plain_room(*size, radius).expand(count, -1, -1, -1), ahead, right) for radius in RADII]
+        rooms = [plain_room(*size, radius, source.device).expand(count, -1, -1, -1) for radius in RADII]
+        warps = [warp(repeated, room, ahead, right) for room in rooms]
         return cls(source, places, torch.stack(warps, dim=1).unflatten(0, places.shape[:2]))
 
     def blend(self, estimate: Estimate) -> Tensor:
@@ -83,9 +84,9 @@ class Views:
 
 @cache
 @torch.inference_mode(False)  # training may use what was first made for a rollout
-def _headings(width: int) -> Tensor:
+def _headings(width: int, device: torch.device) -> Tensor:
     """Return unit vectors (right, ahead) [2, W] of a panorama's columns."""
-    longitude = 2 * torch.pi * ((torch.arange(width) + 0.5) / width - 0.5)
+    longitude = 2 * torch.pi * ((torch.arange(width, device=device) + 0.5) / width - 0.5)
     return torch.stack([longitude.sin(), longitude.cos()])
 
 
@@ -94,7 +95,7 @@ def map_displacements(places: Tensor, height: int, width: int) -> Tensor:
 
     Turning panorama and displacement together rolls these maps, and nothing else.
     """
-    sine, cosine = _headings(width).to(places)
+    sine, cosine = _headings(width, places.device).to(places)
     right, ahead = places[:, :1], places[:, 1:]
     maps = torch.stack([right * sine + ahead * cosine, right * cosine - ahead * sine], dim=1)
     return maps[:, :, None].expand(-1, -1, height, -1)
@@ -145,7 +146,7 @@ class Denoiser(nn.Module):
         """
         frames = places.shape[1]
         moved = places.flatten(0, 1)
-        up = rays(*self.size)[1:2]
+        up = rays(*self.size, noisy.device)[1:2]
         latitude = torch.cat([up, (1 - up * up).sqrt()]).expand(len(moved), -1, -1, -1)
         pixels = torch.cat([noisy.flatten(0, 1), sweep.flatten(0, 1).flatten(1, 2), latitude], dim=1)
         condition = self.embed(embed_numbers(levels.repeat_interleave(frames), moved.norm(dim=1)))
@@ -168,7 +169,8 @@ class Denoiser(nn.Module):
 
     def _read(self, made: Tensor) -> Estimate:
         weights, residual, distance = made.split(self.outputs, dim=1)
-        return Estimate(plain_room(*self.size, RADII[MIDDLE]) + distance, weights.softmax(dim=1), residual)
+        room = plain_room(*self.size, RADII[MIDDLE], made.device)
+        return Estimate(room + distance, weights.softmax(dim=1), residual)
 
 
 @dataclass(frozen=True)

@@ -17,6 +17,7 @@ from torch.nn import functional
 
 NEAREST, FARTHEST = 0.05, 20.0
 """Metres that a distance is clamped to."""
+CPU = torch.device("cpu")
 
 
 @dataclass(frozen=True)
@@ -45,19 +46,19 @@ def blend(warped: Tensor, painted: Tensor, mask: Tensor) -> Tensor:
 
 @cache
 @torch.inference_mode(False)  # training may use what was first made for a rollout
-def rays(height: int, width: int) -> Tensor:
+def rays(height: int, width: int, device: torch.device = CPU) -> Tensor:
     """Return unit vectors [3, H, W] of a panorama's pixels; +x right, +y up, -z ahead."""
-    latitude = torch.pi * (0.5 - (torch.arange(height) + 0.5) / height)[:, None]
-    longitude = 2 * torch.pi * ((torch.arange(width) + 0.5) / width - 0.5)[None]
+    latitude = torch.pi * (0.5 - (torch.arange(height, device=device) + 0.5) / height)[:, None]
+    longitude = 2 * torch.pi * ((torch.arange(width, device=device) + 0.5) / width - 0.5)[None]
     x, z = latitude.cos() * longitude.sin(), -latitude.cos() * longitude.cos()
     return torch.stack([x, latitude.sin().expand(height, width), z])
 
 
 @cache
 @torch.inference_mode(False)  # training may use what was first made for a rollout
-def plain_room(height: int, width: int, radius: float = 2.5) -> Tensor:
+def plain_room(height: int, width: int, radius: float = 2.5, device: torch.device = CPU) -> Tensor:
     """Return log-distances [1, H, W] from the middle of a round room 2.6 m high, 1 m above its floor."""
-    up = rays(height, width)[1:2]
+    up = rays(height, width, device)[1:2]
     level = (1 - up * up).sqrt()
     floor_or_ceiling = torch.where(up < 0, 1.0, 1.6) / up.abs()
     return torch.minimum(floor_or_ceiling, radius / level).log()
@@ -70,7 +71,7 @@ def warp(source: Tensor, log_distance: Tensor, ahead: Tensor, right: Tensor | No
     Each pixel's point is carried back into the source's frame and its colour taken there, bilinearly.
     """
     height, width = log_distance.shape[-2:]
-    points = log_distance.clamp(_log(NEAREST), _log(FARTHEST)).exp() * rays(height, width)
+    points = log_distance.clamp(_log(NEAREST), _log(FARTHEST)).exp() * rays(height, width, log_distance.device)
     x, y, z = points[:, 0], points[:, 1], points[:, 2] - ahead[:, None, None]
     if right is not None:
         x = x + right[:, None, None]
@@ -123,9 +124,10 @@ class Network(nn.Module):
 
     def forward(self, source: Tensor, ahead: Tensor) -> Prediction:
         """Predict the view from `ahead` [B] metres further ahead."""
-        place = rays(*self.size).expand(len(source), -1, -1, -1)
+        place = rays(*self.size, source.device).expand(len(source), -1, -1, -1)
         where = torch.cat([place, ahead[:, None, None, None].expand(-1, 1, *self.size)], dim=1)
-        log_distance = plain_room(*self.size) + self.distance(torch.cat([source, where], dim=1)).float()
+        nearer = self.distance(torch.cat([source, where], dim=1)).float()
+        log_distance = plain_room(*self.size, device=source.device) + nearer
         warped = warp(source, log_distance, ahead)
         made = self.refine(torch.cat([warped, source, log_distance, where], dim=1)).float()
         return Prediction(log_distance, warped, warped + made[:, :3], made[:, 3:].sigmoid())
