@@ -1,9 +1,10 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Sizes that the benchmark of video world models gives their networks, and its measurements with tiny ones."""
+"""Sizes that the benchmarks of video world models give their networks, and their measurements with tiny ones."""
 
 from __future__ import annotations
 
 import json
+import math
 import sys
 
 import pytest
@@ -110,3 +111,98 @@ def test_measures_prints_and_writes_each_model(tmp_path, capsys):
 def test_starts_no_model_once_the_budget_is_used(tmp_path, capsys):
     costs.run(["ltx", "svd"], 0, None, {})
     assert "not run, since 0 s are used: ltx, svd" in capsys.readouterr().out
+
+
+TRAINED = [name for name in PUBLISHED if name != "hunyuan"]
+TINY = {"svd": {"frames": 3, "size": (64, 128)}, "ltx": {"frames": 9, "size": (64, 128)}}
+"""Clips that the tiny networks take, where they differ from `SMALL`."""
+SMALL = {"frames": 5, "size": (32, 64), "batch": 4, "rows": 1}
+
+
+@pytest.fixture(scope="module")
+def training_costs():
+    pytest.importorskip("peft", reason="no peft: pip install 'wiw[diffusers]'")
+    pytest.importorskip("pyarrow", reason="no pyarrow: pip install 'wiw[export]'")
+    import video_training_costs
+
+    return video_training_costs
+
+
+@pytest.fixture(scope="module")
+def panoramas(training_costs, tmp_path_factory):
+    return training_costs.collect(tmp_path_factory.mktemp("panoramas") / "data", size=(64, 128))
+
+
+def choose_options(name, rank):
+    return {**SMALL, **TINY.get(name, {}), **({"lora": 4} if rank else {})}
+
+
+def test_all_recipes_but_that_of_nwm_are_measured(training_costs):
+    from wiw.training.post_training.families import FAMILIES
+
+    assert set(training_costs.RECIPES) == set(FAMILIES) - {"nwm-action"} == {f"{name}-action" for name in TRAINED}
+
+
+@pytest.mark.parametrize("name", TRAINED)
+def test_a_training_step_of_each_recipe_is_measured(name, training_costs, panoramas):
+    from wiw.training.post_training.recipe import load_recipe
+
+    rank = load_recipe(f"{name}-action").lora
+    options = choose_options(name, rank)
+    cost = training_costs.measure(f"{name}-action", shrink(name), panoramas, "cpu", steps=2, options=options)
+    one_pass, update = cost.seconds_per_pass, cost.seconds_per_update
+    seconds = [cost.seconds_loading, cost.seconds_encoding, cost.seconds_first, *cost.seconds_timed, one_pass, update]
+    assert all(math.isfinite(value) and value > 0 for value in seconds)
+    assert math.isfinite(cost.loss)
+    assert (cost.passes, cost.passes_timed, len(cost.seconds_timed)) == (4, 2, 2)
+    assert sum(cost.seconds_timed) == pytest.approx(2 * (2 * one_pass + update))
+    assert cost.seconds_per_step == pytest.approx(4 * one_pass + update)
+    assert cost.clips_per_hour == pytest.approx(3600 * 4 / cost.seconds_per_step)
+    assert (cost.billions_trained < cost.billions) == bool(rank)
+    assert (cost.recipe["batch"], cost.recipe["clips"]) == (4, 40_000)
+
+
+@pytest.mark.parametrize("name", TRAINED)
+def test_networks_in_training_have_the_types_of_loaded_ones(name, training_costs, panoramas, tmp_path):
+    from wiw.training.post_training.corpora import open_corpus
+    from wiw.training.post_training.families import PretrainedWeights, find_family
+    from wiw.training.post_training.recipe import load_recipe
+
+    family, recipe = find_family(f"{name}-action"), load_recipe(f"{name}-action")
+    recipe = load_recipe(f"{name}-action", options=choose_options(name, recipe.lora))
+    corpus, recipe = family.fit(open_corpus(panoramas, "all"), recipe)
+    made = training_costs.make_trainer(family, shrink(name), corpus, recipe, "cpu").model
+    weights = PretrainedWeights(str(tiny_pipelines.save(name, tmp_path)), device="cpu")
+    loaded = family.load(corpus, recipe, weights).model
+    for place in PUBLISHED[name].networks:
+        own, other = (each.objective.pipeline.components[place] for each in (made, loaded))
+        assert list_types(own) == list_types(other), place
+        assert own.training == other.training, place
+    for place in made.places:
+        kinds = [{key: value.shape for key, value in each.list_trained(place).items()} for each in (made, loaded)]
+        assert kinds[0] == kinds[1]
+
+
+def test_training_costs_are_printed_and_written_and_so_are_errors(training_costs, panoramas, tmp_path, capsys):
+    def fail():
+        raise ValueError("no such network\nat all")
+
+    sizes = {"ltx": shrink("ltx"), "svd": Published({"unet": fail}, lambda: None)}
+    options = {"steps": 1, "options": choose_options("ltx", 0)}
+    names = ["ltx-action", "svd-action"]
+    training_costs.run(names, 600, tmp_path / "costs.json", sizes, data=panoramas, device="cpu", **options)
+    ltx, svd = json.loads((tmp_path / "costs.json").read_text())["models"]
+    assert ltx["model"] == "ltx-action" and ltx["seconds_per_clip"] > 0 and ltx["recipe"]["size"] == [64, 128]
+    assert svd["error"] == "ValueError: no such network" and svd["options"]["frames"] == 9
+    lines = capsys.readouterr().out.splitlines()
+    assert lines[1].startswith("ltx ") and lines[2].split() == ["svd", *svd["error"].split()]
+
+
+def test_a_training_that_does_not_fit_says_what_to_lower(training_costs, panoramas, monkeypatch):
+    def fail(*_):
+        raise torch.OutOfMemoryError("CUDA out of memory")
+
+    monkeypatch.setattr(training_costs, "time_steps", fail)
+    options = {"data": panoramas, "device": "cpu", "options": choose_options("ltx", 0)}
+    row, record = training_costs.attempt("ltx-action", shrink("ltx"), **options)
+    assert "does not fit: DeviceMemoryError" in row and "optimizer=adamw8bit" in record["error"]
