@@ -145,17 +145,18 @@ def unpack_voxels(keys: NDArray[np.int64]) -> NDArray[np.float64]:
     return (cells - _OFFSET + 0.5) * VOXEL
 
 
-def split_voxels(keys: NDArray[np.int64]) -> list[NDArray[np.int64]]:
+def split_voxels(keys: NDArray[np.int64], bridged: bool = True) -> list[NDArray[np.int64]]:
     """Return the parts of a thing that stand apart as seen from above, the largest first.
 
     What stands apart on the floor, or in its upper third, as the backs of chairs do; the rest joins the nearest part.
 
     Args:
         keys: sorted keys of its voxels.
+        bridged: whether few voxels hang together across gaps of two.
     """
     points = unpack_voxels(keys)
     low, high = points[:, 2].min(), points[:, 2].max()
-    whole, upper = (_find_parts(points[points[:, 2] >= level]) for level in (low, low + (high - low) * 2 / 3))
+    whole, upper = (_find_parts(points[points[:, 2] >= level], bridged) for level in (low, low + (high - low) * 2 / 3))
     parts = max(whole, upper, key=len)
     if len(parts) < 2:
         return [keys]
@@ -188,13 +189,13 @@ def split_along_wall(keys: NDArray[np.int64], shares: NDArray[np.float64]) -> li
     return sorted(found, key=lambda own: (-len(own), int(own[0]))) or [keys]
 
 
-def _find_parts(points: NDArray[np.float64]) -> list[NDArray[np.float64]]:
+def _find_parts(points: NDArray[np.float64], bridged: bool) -> list[NDArray[np.float64]]:
     """Return the points [n, 2] of each part that stands apart as seen from above, scraps left out."""
     cells = np.floor(points[:, :2] / VOXEL).astype(np.intp)
     cells -= cells.min(axis=0) - 1
     plan = np.zeros(cells.max(axis=0) + 2, np.uint8)
     plan[cells[:, 0], cells[:, 1]] = 1
-    if len(points) < SPARSE:
+    if bridged and len(points) < SPARSE:
         plan = cv2.dilate(plan, np.ones((3, 3), np.uint8))
     _, labels = cv2.connectedComponents(plan, connectivity=8)
     part = labels[cells[:, 0], cells[:, 1]]

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from wiw.mapping.object_map import ObjectMap
 from wiw.mapping.openings import Opening
-from wiw.mapping.views import CAMERA_HEIGHT, VIEW_NAMES, VIEW_YAWS_DEG, Views
+from wiw.mapping.views import VIEW_NAMES, VIEW_YAWS_DEG, Views
 
 VISITED = 1.2
 """Metres within which the agent has visited a landmark."""
@@ -136,6 +136,6 @@ def draw_opening(views: Views, view: int, opening: Opening) -> NDArray[np.bool_]
     share = (slope * forward[0] - side[0]) / np.where(np.abs(along) < 1e-9, np.inf, along)
     depth = forward[0] + share * (forward[1] - forward[0])
     through = (np.abs(along) >= 1e-9) & (share >= 0) & (share <= 1) & (depth > 0.05)
-    level = CAMERA_HEIGHT + rise[:, None] * depth
+    level = views.T_start_camera[view, 2, 3] + rise[:, None] * depth
     inside = (level > OPENING_HEIGHT[0]) & (level < OPENING_HEIGHT[1])
     return through & inside & (views.depth[view] > depth - _SLACK)

@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from scipy import ndimage
 
 from wiw.mapping.openings import Opening, clean_walls, find_openings, name_openings
-from wiw.mapping.views import CAMERA_HEIGHT, check_panorama
+from wiw.mapping.views import check_panorama, measure_camera_height
 
 CELL = 0.1
 """Metres."""
@@ -84,7 +84,8 @@ class OccupancyGrid:
         check_panorama(depth, odometry)
         rays = _get_rays(depth.shape[0], depth.shape[1])
         picture = depth[STRIDE // 2 :: STRIDE, STRIDE // 2 :: STRIDE]
-        flat, height = picture * rays.cosine, CAMERA_HEIGHT + picture * rays.sine
+        above = measure_camera_height(depth)
+        flat, height = picture * rays.cosine, above + picture * rays.sine
         azimuth = odometry[2] + rays.azimuth
         usable = (picture > 0) & (flat < RANGE)
         solid = usable & (height > OBSTACLE[0]) & (height < OBSTACLE[1])
@@ -97,7 +98,7 @@ class OccupancyGrid:
         for mask, layer in ((solid, self.occupied), (ground, self.free), (high, self.walls)):
             rows, columns = np.nonzero(mask)
             layer[self._place(odometry, flat[rows, columns], azimuth[columns])] = True
-        self._sweep(flat, height, usable, solid, ground, azimuth, odometry)
+        self._sweep(flat, height, above, usable, solid, ground, azimuth, odometry)
         self.visits.append(np.array(odometry[:2]))
         _forget(self)
         found = find_openings(self.free & ~self.occupied, self.wall_cells, self.to_points)
@@ -108,16 +109,20 @@ class OccupancyGrid:
         self,
         flat: NDArray[np.float32],
         height: NDArray[np.float32],
+        above: float,
         usable: NDArray[np.bool_],
         solid: NDArray[np.bool_],
         ground: NDArray[np.bool_],
         azimuth: NDArray[np.float64],
         odometry: NDArray[np.float64],
     ) -> None:
-        """Mark the floor of each column as free, up to the first thing in the way or the end of visible floor."""
+        """Mark the floor of each column as free, up to the first thing in the way or the end of visible floor.
+
+        The camera is `above` the floor.
+        """
         nearest = np.where(solid, flat, np.inf).min(axis=0)
         drop = usable & (height < -DROP)
-        crossing = flat * (CAMERA_HEIGHT / np.maximum(CAMERA_HEIGHT - height, 1e-3))
+        crossing = flat * (above / np.maximum(above - height, 1e-3))
         nearest = np.minimum(nearest, np.where(drop, crossing, np.inf).min(axis=0))
         before = ground & (flat < nearest)
         farthest = np.where(before, flat, 0.0).max(axis=0) + FLOOR_GAP

@@ -4,6 +4,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import lru_cache
 from typing import Any
 
 import numpy as np
@@ -20,6 +21,14 @@ HFOV_DEG = 105.0
 SIZE = (384, 448)
 """(H, W) of a view."""
 CAMERA_HEIGHT = 1.0
+"""Metres above what the agent stands on, which is the floor unless it has stepped onto something low."""
+LEVELS = (0.9, 1.6)
+"""Metres below the camera between which the floor is looked for."""
+LEVEL_STEP = 0.05
+LEVEL_REACH = 5.0
+"""Metres within which the floor's level is measured."""
+LEVEL_STRIDE = 4
+"""Every so many rows and columns of a panorama are measured."""
 
 
 @dataclass(frozen=True)
@@ -66,7 +75,8 @@ def cut_views(
         )
     images = cut_images(panorama, size, hfov_deg)
     distance = cut_labels(depth, size, hfov_deg)
-    return Views(images, distance_to_planar(distance, hfov_deg), place_cameras(odometry), odometry.copy(), hfov_deg)
+    cameras = place_cameras(odometry, measure_camera_height(depth))
+    return Views(images, distance_to_planar(distance, hfov_deg), cameras, odometry.copy(), hfov_deg)
 
 
 def cut_images(
@@ -81,8 +91,10 @@ def cut_labels(values: NDArray[Any], size: tuple[int, int] = SIZE, hfov_deg: flo
     return to_perspective(values[..., None], hfov_deg, size, VIEW_YAWS_DEG, interpolation="nearest")[..., 0]
 
 
-def place_cameras(odometry: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Return T_start_camera of the four views, float64 [4, 4, 4], for an agent at (x, y, azimuth)."""
+def place_cameras(odometry: NDArray[np.float64], height: float = CAMERA_HEIGHT) -> NDArray[np.float64]:
+    """Return T_start_camera of the four views, float64 [4, 4, 4], for an agent at (x, y, azimuth), its camera so many
+    metres above the floor.
+    """
     x, y, azimuth = odometry
     angles = azimuth + np.radians(VIEW_YAWS_DEG)
     cos, sin = np.cos(angles), np.sin(angles)
@@ -90,8 +102,46 @@ def place_cameras(odometry: NDArray[np.float64]) -> NDArray[np.float64]:
     poses[:, 0, 0], poses[:, 1, 0] = sin, -cos  # the camera's right
     poses[:, 2, 1] = 1.0  # its up
     poses[:, 0, 2], poses[:, 1, 2] = -cos, -sin  # its back
-    poses[:, :, 3] = (x, y, CAMERA_HEIGHT, 1.0)
+    poses[:, :, 3] = (x, y, height, 1.0)
     return poses
+
+
+def measure_camera_height(depth: NDArray[np.float32]) -> float:
+    """Return how many metres the camera of a panorama of distances float32 [H, W] is above the floor.
+
+    The floor is the level below the camera at which most area lies. Agents can step onto low things, such as a coffee
+    table; odometry does not tell, and all that they see from there would be mapped too low. Levels near `CAMERA_HEIGHT`
+    count as that.
+    """
+    rays, below = _get_rays_below(depth.shape[0])
+    seen = depth[below, LEVEL_STRIDE // 2 :: LEVEL_STRIDE].astype(np.float64)
+    level, flat = seen * rays.drop, seen * rays.cosine
+    found = (seen > 0) & (flat < LEVEL_REACH) & (level > LEVELS[0] - LEVEL_STEP) & (level < LEVELS[1])
+    if not found.any():
+        return CAMERA_HEIGHT
+    level, area = level[found], (seen * flat / rays.drop)[found]  # of a level surface, by solid angle
+    steps = (level / LEVEL_STEP).astype(np.intp)
+    near = np.abs(steps - np.bincount(steps, area).argmax()) <= 1
+    height = float(np.average(level[near], weights=area[near]))
+    return height if height > CAMERA_HEIGHT + 2 * LEVEL_STEP else CAMERA_HEIGHT
+
+
+@dataclass(frozen=True)
+class _RaysBelow:
+    """Rays of a panorama's rows below the horizon, each [R, 1]."""
+
+    drop: NDArray[np.float64]
+    """Metres down per metre along the ray."""
+    cosine: NDArray[np.float64]
+    """Metres away on the floor plan per metre along the ray."""
+
+
+@lru_cache(maxsize=8)
+def _get_rays_below(height: int) -> tuple[_RaysBelow, NDArray[np.intp]]:
+    """Return the rays of the measured rows below the horizon, and the rows."""
+    rows = np.arange(height // 2 + LEVEL_STRIDE // 2, height, LEVEL_STRIDE)
+    pitch = np.pi * ((rows + 0.5) / height - 0.5)
+    return _RaysBelow(np.sin(pitch)[:, None], np.cos(pitch)[:, None]), rows
 
 
 def unproject(views: Views, view: NDArray[np.intp], rows: NDArray[np.intp], columns: NDArray[np.intp]) -> NDArray[Any]:

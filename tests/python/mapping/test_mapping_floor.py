@@ -11,11 +11,14 @@ from mapping_tours import Mapped, Tour, add_all, mapped, walk
 from numpy.typing import NDArray
 
 from wiw.action import FORWARD, TURN_LEFT, TURN_RIGHT, to_trajectory
+from wiw.datasets.cameras import camera_pose
+from wiw.datasets.worlds import world
 from wiw.errors import ArgumentError
 from wiw.mapping.alignment import find_wall_azimuth, turn_odometry
 from wiw.mapping.occupancy import CELL, OccupancyGrid
 from wiw.mapping.openings import name_openings
 from wiw.mapping.routes import RADIUS, STEP, find_refused, follow_heading, measure_distances, route
+from wiw.mapping.views import CAMERA_HEIGHT, cut_views, measure_camera_height, unproject
 
 SCENES = ["apartments:val/3", "apartments:val/1"]
 
@@ -31,6 +34,38 @@ def navigable(known: Mapped) -> NDArray[np.bool_]:
     mesh, shape = known.tour.world.navmesh, known.grid.free.shape
     points = known.tour.to_world(known.grid.to_points(np.argwhere(np.ones(shape, bool)))).astype(np.float32)
     return (np.asarray(mesh.is_navigable(points)) & (np.asarray(mesh.island_of(points)) == 0)).reshape(shape)
+
+
+# -- the camera --------------------------------------------------------------------------------------------------------
+
+
+def test_the_camera_of_an_agent_on_the_floor_is_where_its_legs_end() -> None:
+    for scene in SCENES:
+        for seen in mapped(scene).tour.observations:
+            assert measure_camera_height(seen["depth"]) == CAMERA_HEIGHT
+
+
+def test_an_agent_on_a_coffee_table_maps_the_home_where_it_is() -> None:
+    """Navigation meshes lead over low furniture; odometry does not tell, but the floor shows it."""
+    here = world("apartments:val/9", "cpu")
+    points = here.ground.put_down(here.navmesh.sample(600, 0)).astype(float)
+    raised = points[(points[:, 1] > 0.15) & (points[:, 1] < 0.6)]
+    assert len(raised) > 2
+    for place in raised[:4]:
+        seen = here.renderer.panorama(camera_pose(place, 1.0)[None], outputs=("color", "depth"))
+        depth, height = seen["depth"][0], CAMERA_HEIGHT + place[1]
+        assert measure_camera_height(depth) == pytest.approx(height, abs=0.03)
+        views = cut_views(seen["color"][0], depth, np.zeros(3))
+        np.testing.assert_allclose(views.T_start_camera[:, 2, 3], height, atol=0.03)
+        points = unproject(views, *np.nonzero(views.depth > 0))
+        assert points[:, 2].min() > -0.1  # and not as far below the floor as the agent is above it
+        grid = OccupancyGrid()
+        grid.add(depth, np.zeros(3))
+        assert grid.area > 4
+
+
+def test_nothing_seen_below_says_nothing_about_the_camera() -> None:
+    assert measure_camera_height(np.zeros((64, 128), np.float32)) == CAMERA_HEIGHT
 
 
 # -- the grid ----------------------------------------------------------------------------------------------------------

@@ -309,3 +309,11 @@ def test_what_stands_apart_on_the_floor_or_above_is_taken_apart() -> None:
     scrap = seat[0][:3] + np.array([0.6, 0, 0])
     one = np.unique(pack_voxels(np.concatenate([seat[0], backs[0], scrap])))
     assert len(split_voxels(one)) == 1
+
+
+def test_small_things_side_by_side_are_several_where_gaps_are_not_bridged() -> None:
+    cup = np.argwhere(np.ones((2, 2, 2))) * VOXEL
+    two = np.unique(pack_voxels(np.concatenate([cup, cup + np.array([3 * VOXEL, 0, 0])]) + VOXEL / 2))
+    assert len(split_voxels(two)) == 1  # as the sparse voxels of a thing seen from afar
+    found = split_voxels(two, bridged=False)
+    assert [len(part) for part in found] == [8, 8] and set(np.concatenate(found)) == set(two)

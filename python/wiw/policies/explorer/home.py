@@ -217,7 +217,7 @@ def _take_apart(things: Sequence[MapObject], objects: ObjectMap, knowledge: Know
             category = objects.categories.index(thing.category)
             parts = split_along_wall(thing.voxels, objects.votes.measure_shares(thing.voxels, category))
         elif length > TOO_LONG * knowledge.sizes.get(thing.category, (np.inf,))[0]:
-            parts = split_voxels(thing.voxels)
+            parts = split_voxels(thing.voxels, bridged=thing.category not in SMALL)
         found.append(replace(thing, voxels=parts[0]))
         for part in parts[1:]:
             found.append(replace(thing, id=unused, voxels=part))
