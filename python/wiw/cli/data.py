@@ -89,6 +89,7 @@ BAR = 40
 def _print_totals(figures: NavigationStatistics, clip: int) -> None:
     from rich.console import Console
     from rich.table import Table
+    from rich.text import Text
 
     totals = figures.totals
     print(
@@ -106,7 +107,7 @@ def _print_totals(figures: NavigationStatistics, clip: int) -> None:
         table.add_column(column, justify="left" if column.startswith("least") else "right")
     for each in figures.scenes[:LISTED_SCENES]:
         numbers = f"{each.area:.0f}", str(each.frames), str(each.segments), f"{each.coverage:.0%}", str(each.dropped)
-        table.add_row(each.scene, *numbers)
+        table.add_row(Text(each.scene), *numbers)
     Console().print(table)
 
 

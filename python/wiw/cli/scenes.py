@@ -33,6 +33,7 @@ def draw_scenes(
     from PIL import Image
     from rich.console import Console
     from rich.table import Table
+    from rich.text import Text
 
     from wiw.errors import ArgumentError
     from wiw.files import atomic_file
@@ -54,7 +55,7 @@ def draw_scenes(
     rows = []
     for name in names:
         place = _load(name, backend)
-        table.add_row(*_list_facts(place))
+        table.add_row(*map(Text, _list_facts(place)))
         rows.append(place)
     Console().print(table)
     with atomic_file(out) as draft:
@@ -81,6 +82,7 @@ def verify_scans(
     """
     from rich.console import Console
     from rich.table import Table
+    from rich.text import Text
 
     from wiw.cli.terminal import printable
     from wiw.datasets.scan_check import check_scan
@@ -97,7 +99,7 @@ def verify_scans(
         check = check_scan(file)
         checks.append(check)
         table.add_row(
-            name_scene(file),
+            Text(name_scene(file)),
             *(f"{number:,}" for number in (check.triangles, check.textures)),
             f"{100 * check.missing:.1f}",
             *map(str, (check.objects, check.categories, check.rooms)),

@@ -148,12 +148,12 @@ async def _show(server: Any, name: str, ready: asyncio.Event) -> None:
     from wiw.serving.status import Status
 
     await ready.wait()
-    console = Console(highlight=False, soft_wrap=True)
+    console = Console(highlight=False, soft_wrap=True, markup=False)
     accepts = server.model.accepts
     height, width = accepts.size
     console.print(f"serving  {name}: {accepts.view} {height}x{width}, control {accepts.control}, up to", end=" ")
     console.print(f"{accepts.best_batch} rows a batch")
-    console.print(f"run      wiw run imagenav --world-model remote:{server.address}", markup=False)
+    console.print(f"run      wiw run imagenav --world-model remote:{server.address}")
     status = Status(server)
     if console.is_terminal:
         with Live(console=console, auto_refresh=False) as live:

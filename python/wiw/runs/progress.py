@@ -164,9 +164,9 @@ class TerminalBoard:
 
         self._console = Console(stderr=True)
         self._bars = Progress(
-            TextColumn("[bold]{task.description:<12}"),
+            TextColumn("{task.description:<12}", style="bold", markup=False),
             BarColumn(bar_width=32),
-            TextColumn("{task.fields[text]}"),
+            TextColumn("{task.fields[text]}", markup=False),
             TimeElapsedColumn(),
             TextColumn("<"),
             TimeRemainingColumn(),
@@ -197,7 +197,7 @@ class TerminalBoard:
             self._begun[arm] = time.monotonic(), progress.ended
         if quarter > self._quarters[arm]:
             self._quarters[arm] = quarter
-            self._console.print(f"{arm}: {progress.text}{self._describe_time_left(arm, progress)}", highlight=False)
+            self.note(f"{arm}: {progress.text}{self._describe_time_left(arm, progress)}")
 
     def _describe_time_left(self, arm: str, progress: Progress) -> str:
         """Return e.g. ", about 0:12:30 left" for the arm; empty at its end."""

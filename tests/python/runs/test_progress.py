@@ -3,11 +3,14 @@
 
 from __future__ import annotations
 
+from functools import partial
+from io import StringIO
 from pathlib import Path
 from typing import Any
 
 import pytest
 from fakes import LineAgent, LineTask
+from rich.console import Console
 
 from wiw.runs.progress import ArmProgress, SilentBoard, TerminalBoard
 from wiw.runs.store import RunStore
@@ -58,3 +61,18 @@ def test_plain_lines_say_how_long_the_rest_takes(
         "warp: 6/8 episodes, SR 100 %, about 0:01:00 left",
         "warp: 8/8 episodes, SR 100 %",
     ]
+
+
+@pytest.mark.parametrize("terminal", [True, False])
+def test_names_with_brackets_are_shown_as_they_are(terminal: bool, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Rich would take them for markup, and stop at one that closes nothing."""
+    shown = StringIO()
+    monkeypatch.setattr("rich.console.Console", partial(Console, file=shown, force_terminal=terminal, width=100))
+    board, progress = TerminalBoard(), ArmProgress(1, 1)
+    for _ in range(2):
+        board.show("warp[/size=144]", progress)
+        progress.decisions = 1
+        progress.count("done", {"success": 1.0})
+    board.show("warp[/size=144]", progress)
+    board.close()
+    assert "warp[/size=144]" in shown.getvalue()
