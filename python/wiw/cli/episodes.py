@@ -64,7 +64,7 @@ def episodes(
         overwrite: Whether to replace an existing file.
     """
     from wiw.datasets.episodes import save
-    from wiw.errors import ArgumentError, FileError
+    from wiw.errors import ArgumentError
     from wiw.registry import TASKS
 
     if episodes < 1:
@@ -81,10 +81,7 @@ def episodes(
             f"run {task} --seed {seed} --episodes {episodes}` runs the same ones anywhere"
         )
     found = made.episodes(episodes)
-    try:
-        save(out, found, task, **made.file_header)
-    except OSError as error:
-        raise FileError(f"{out}: cannot be written ({error.strerror}); choose another with --out") from error
+    save(out, found, task, **made.file_header)
     places = count_noun(len({episode.scene for episode in found}), "scene")
     lengths = sorted(episode.geodesic for episode in found)
     print(f"{count_noun(len(found), 'episode')} in {places}, {lengths[0]:.1f} to {lengths[-1]:.1f} m")

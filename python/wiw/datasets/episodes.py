@@ -15,6 +15,7 @@ from typing import Any
 from wiw.datasets import habitat
 from wiw.datasets.fields import integer, length, number, point, positive, text
 from wiw.errors import ArgumentError, FileError
+from wiw.files import atomic_file
 from wiw.json_text import parse_json
 from wiw.scenes import absolute, is_generated, resolve
 from wiw.types import Episode
@@ -25,12 +26,17 @@ MOST_BYTES = 256 << 20
 
 
 def save(path: str | Path, episodes: Sequence[Episode], task: str, **about: Any) -> None:
-    """Write an episode file, gzipped if its name ends in .gz; `about` (generator, seed, ...) goes into its header."""
+    """Write an episode file, gzipped if its name ends in .gz; `about` (generator, seed, ...) goes into its header.
+
+    Raises:
+        FileError: it cannot be written; a file that was there is as it was.
+    """
     folder = Path(path).absolute().parent
     items = [_item(episode, folder) for episode in episodes]
     body = {"format": "wiw-episodes", "version": VERSION, "task": task, **about, "episodes": items}
     text = json.dumps(body, indent=1, allow_nan=False).encode()
-    Path(path).write_bytes(gzip.compress(text, mtime=0) if str(path).endswith(".gz") else text)
+    with atomic_file(Path(path)) as draft:
+        draft.write_bytes(gzip.compress(text, mtime=0) if str(path).endswith(".gz") else text)
 
 
 def _item(episode: Episode, folder: Path) -> dict[str, Any]:

@@ -169,6 +169,9 @@ def test_rank_agreement_is_measured_on_stored_decisions(train: Any, tmp_path: Pa
     save_decisions(tmp_path / "long.parquet", replace(stored, plans=np.ones((2, 3, 9), np.int8)))
     with pytest.raises(ArgumentError, match="at most 8 actions"):
         train(tmp_path / "other", decisions=tmp_path / "long.parquet")
+    save_decisions(tmp_path / "seen.parquet", replace(stored, scenes=("a", "house")))
+    with pytest.raises(ArgumentError, match="decisions: expected scenes that are not trained on, got house"):
+        train(tmp_path / "third", decisions=tmp_path / "seen.parquet")
 
 
 def test_a_training_that_is_stopped_while_it_validates_ends_with_the_same_bytes(

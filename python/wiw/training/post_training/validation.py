@@ -5,6 +5,7 @@ from __future__ import annotations
 
 import json
 from collections.abc import Callable, Mapping
+from collections.abc import Set as AbstractSet
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -17,6 +18,7 @@ from wiw.datasets.decisions import Decisions, digest_decisions, load_decisions
 from wiw.datasets.navigation import Part
 from wiw.errors import ArgumentError
 from wiw.files import atomic_file
+from wiw.scenes import strip_edits
 from wiw.training.checkpoint import ResumableTrainer
 from wiw.training.decision_errors import measure_decisions
 from wiw.training.held_out_clips import Frames, HeldOutClips, Imagine, ShownView, measure_clips
@@ -86,9 +88,9 @@ def find_held_out(
         recipe: of the training.
 
     Raises:
-        ArgumentError: another kind of dataset or height of the camera, nothing is held out, something is in both, or
-            decisions for an arm.
-        FileError: the dataset is missing or damaged.
+        ArgumentError: another kind of dataset or height of the camera, nothing is held out, something is in both,
+            decisions for an arm, or decisions in scenes that are trained on.
+        FileError: the dataset, or the file of decisions, is missing or damaged.
     """
     if recipe.validate_every is None or (validation is None and corpus.part != "train"):
         return None
@@ -111,6 +113,7 @@ def find_held_out(
         raise ArgumentError(
             f"validation: expected {corpus.unit}s that are not trained on, got {', '.join(sorted(names & trained)[:3])}"
         )
+    _require_unseen_decisions(decisions, trained)
     if not names:
         raise ArgumentError(
             f"validation: no {corpus.unit} of {held_out.data.folder} is held out; collect more {corpus.unit}s, raise "
@@ -118,6 +121,23 @@ def find_held_out(
             "validate_every=null)"
         )
     return held_out
+
+
+def _require_unseen_decisions(decisions: str | Path | None, trained: AbstractSet[str]) -> None:
+    """Check that no stored decision is made in a scene that is trained on.
+
+    Raises:
+        ArgumentError: names such scenes.
+        FileError: the file is damaged.
+    """
+    if decisions is None:
+        return
+    seen = sorted(trained & {strip_edits(name) for name in load_decisions(decisions).scenes})
+    if seen:
+        raise ArgumentError(
+            f"decisions: expected scenes that are not trained on, got {', '.join(seen[:3])}; collect decisions "
+            "in others, such as apartments:val:40"
+        )
 
 
 def build_validation_set(
