@@ -111,7 +111,7 @@ def measure_camera_height(depth: NDArray[np.float32]) -> float:
 
     The floor is the level below the camera at which most area lies. Agents can step onto low things, such as a coffee
     table; odometry does not tell, and all that they see from there would be mapped too low. Levels near `CAMERA_HEIGHT`
-    count as that.
+    count as that. Beside a larger floor up to 0.6 m lower, that is taken for the floor.
     """
     rays, below = _get_rays_below(depth.shape[0])
     seen = depth[below, LEVEL_STRIDE // 2 :: LEVEL_STRIDE].astype(np.float64)
