@@ -33,6 +33,8 @@ TURN_COST = 0.05
 """Metres that a turn is worth: enough to prefer straight paths, too little for a detour."""
 START_RADIUS = 0.35
 """Metres around the agent in which it may pass closer to obstacles than it fits: it stands there."""
+TOP_RADIUS = 1.0
+"""Metres around the agent in which it may step off what it stands on, such as a coffee table."""
 NEIGHBOURS = ((0, 1), (1, 0), (1, 1), (1, -1), (1, 2), (2, 1), (2, -1), (1, -2))
 """Steps between cells whose lengths make up distances: sixteen directions, counted both ways."""
 WEIGHT = 1.15
@@ -280,7 +282,20 @@ def _open_cells(grid: OccupancyGrid, pose: NDArray[np.float64], squeeze: bool = 
     open_ = grid.standable.copy()
     open_[window] |= grid.free[window] & (near[window] == 0)
     open_[row, column] = True
+    if grid.occupied[row, column]:
+        open_ |= _find_way_off(grid, row, column)
     return open_
+
+
+def _find_way_off(grid: OccupancyGrid, row: int, column: int) -> NDArray[np.bool_]:
+    """Return the cells over which an agent leaves what it stands on: the thing close around a cell, and its rim."""
+    reach = int(TOP_RADIUS / CELL)
+    window = slice(max(0, row - reach), row + reach + 1), slice(max(0, column - reach), column + reach + 1)
+    _, parts = cv2.connectedComponents((grid.occupied & ~grid.wall_cells)[window].view(np.uint8), connectivity=8)
+    own = parts == parts[row - window[0].start, column - window[1].start]
+    found = np.zeros_like(grid.occupied)
+    found[window] = cv2.dilate(own.view(np.uint8), np.ones((5, 5), np.uint8)).view(bool)
+    return np.asarray(found & grid.known & ~grid.wall_cells)
 
 
 def _find_cell(grid: OccupancyGrid, pose: NDArray[np.float64]) -> tuple[int, int]:

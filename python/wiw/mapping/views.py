@@ -22,9 +22,12 @@ SIZE = (384, 448)
 """(H, W) of a view."""
 CAMERA_HEIGHT = 1.0
 """Metres above what the agent stands on, which is the floor unless it has stepped onto something low."""
-LEVELS = (0.9, 1.6)
+LEVELS = (0.85, 1.6)
 """Metres below the camera between which the floor is looked for."""
 LEVEL_STEP = 0.05
+"""Metres between levels that are told apart."""
+LEAST_ROWS = 64
+"""Rows of a panorama from which levels can be measured."""
 LEVEL_REACH = 5.0
 """Metres within which the floor's level is measured."""
 LEVEL_STRIDE = 4
@@ -111,17 +114,20 @@ def measure_camera_height(depth: NDArray[np.float32]) -> float:
 
     The floor is the level below the camera at which most area lies. Agents can step onto low things, such as a coffee
     table; odometry does not tell, and all that they see from there would be mapped too low. Levels near `CAMERA_HEIGHT`
-    count as that. Beside a larger floor up to 0.6 m lower, that is taken for the floor.
+    count as that. Beside a larger floor up to 0.6 m lower, that is taken for the floor, and the agent's own for things.
     """
+    if depth.shape[0] < LEAST_ROWS:
+        return CAMERA_HEIGHT
     rays, below = _get_rays_below(depth.shape[0])
     seen = depth[below, LEVEL_STRIDE // 2 :: LEVEL_STRIDE].astype(np.float64)
     level, flat = seen * rays.drop, seen * rays.cosine
-    found = (seen > 0) & (flat < LEVEL_REACH) & (level > LEVELS[0] - LEVEL_STEP) & (level < LEVELS[1])
+    found = (seen > 0) & (flat < LEVEL_REACH) & (level > LEVELS[0]) & (level < LEVELS[1])
     if not found.any():
         return CAMERA_HEIGHT
     level, area = level[found], (seen * flat / rays.drop)[found]  # of a level surface, by solid angle
     steps = (level / LEVEL_STEP).astype(np.intp)
-    near = np.abs(steps - np.bincount(steps, area).argmax()) <= 1
+    totals = np.convolve(np.bincount(steps, area), np.ones(3), "same")  # a level may lie at the edge of two steps
+    near = np.abs(steps - totals.argmax()) <= 1
     height = float(np.average(level[near], weights=area[near]))
     return height if height > CAMERA_HEIGHT + 2 * LEVEL_STEP else CAMERA_HEIGHT
 

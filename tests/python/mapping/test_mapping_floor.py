@@ -62,10 +62,32 @@ def test_an_agent_on_a_coffee_table_maps_the_home_where_it_is() -> None:
         grid = OccupancyGrid()
         grid.add(depth, np.zeros(3))
         assert grid.area > 4
+        away = measure_distances(grid, np.zeros(3))
+        goals = np.argwhere(np.isfinite(away) & (away > 1.2))
+        assert len(goals) > 20  # it can step down
+        found = route(grid, np.zeros(3), grid.to_points(goals[len(goals) // 2]), 0.2)
+        assert found.reached and len(found.actions)
+
+
+def test_the_agents_own_floor_is_the_level_that_most_area_lies_at() -> None:
+    """Even if its level lies between two steps of the histogram, and less of a lower floor is all in one."""
+    rows, columns = np.meshgrid(np.arange(288), np.arange(576), indexing="ij")
+    pitch, azimuth = np.pi * ((rows + 0.5) / 288 - 0.5), 2 * np.pi * (columns + 0.5) / 576
+    noise = np.random.default_rng(0).normal(1, 0.002, rows.shape)
+    for edge, lower, expected in ((0.4, 0.32, CAMERA_HEIGHT), (-0.4, 0.32, 1.32), (0.4, 0.0, CAMERA_HEIGHT)):
+        near = CAMERA_HEIGHT / np.maximum(np.sin(pitch), 1e-3)
+        far = (CAMERA_HEIGHT + lower) / np.maximum(np.sin(pitch), 1e-3)
+        ahead = near * np.cos(pitch) * np.cos(azimuth)
+        depth = np.where(ahead < edge, near, far)
+        depth[depth * np.cos(pitch) > 4] = 0  # the floor ends there
+        assert measure_camera_height((depth * noise).astype(np.float32)) == pytest.approx(expected, abs=0.02)
 
 
 def test_nothing_seen_below_says_nothing_about_the_camera() -> None:
     assert measure_camera_height(np.zeros((64, 128), np.float32)) == CAMERA_HEIGHT
+    assert measure_camera_height(np.full((64, 128), np.nan, np.float32)) == CAMERA_HEIGHT
+    for height in (1, 2, 15, 63):
+        assert measure_camera_height(np.full((height, 2 * height), 3.0, np.float32)) == CAMERA_HEIGHT
 
 
 # -- the grid ----------------------------------------------------------------------------------------------------------
