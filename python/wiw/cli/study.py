@@ -59,7 +59,7 @@ def study_data_scaling(
         decision_scenes: Scenes of the stored decisions. Default: apartments:val:40.
         decisions_per_scene: Decisions per scene, fewer if there is no room. Default: 30.
         imagenav: Episodes of ImageNav in which to run the first seed's models as well; 0 for none.
-        workers: Number of processes, each with one thread; results do not depend on it.
+        workers: Number of processes, each with one thread; on the CPU, results do not depend on it.
         device: Where to train: cpu, cuda, cuda:1, ... Default: the GPU if there is one, which all workers share. Models
             are evaluated on the CPU.
     """

@@ -152,7 +152,7 @@ def split_voxels(keys: NDArray[np.int64], bridged: bool = True) -> list[NDArray[
 
     Args:
         keys: sorted keys of its voxels.
-        bridged: whether few voxels hang together across gaps of two.
+        bridged: whether the parts of a sparse thing are joined across gaps of up to two voxels.
     """
     points = unpack_voxels(keys)
     low, high = points[:, 2].min(), points[:, 2].max()

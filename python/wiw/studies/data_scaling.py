@@ -122,6 +122,7 @@ def data_scaling(
             another study, or several processes of torchrun.
         DependencyError: torch or pyarrow is not installed.
         FileError: the dataset is missing or damaged, or a file cannot be written.
+        DeviceMemoryError: the device's memory does not suffice for so many workers.
         InfrastructureError: a worker process has died.
         TrainingError: a loss is not finite.
     """

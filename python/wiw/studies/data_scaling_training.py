@@ -18,7 +18,7 @@ from wiw.datasets.decisions import Decisions, load_decisions
 from wiw.datasets.navigation import Clips, NavigationData, SelectedClips
 from wiw.errors import FileError
 from wiw.files import atomic_file
-from wiw.networks import describe_device, single_thread
+from wiw.networks import describe_device, memory_guard, single_thread
 from wiw.studies.data_scaling_plan import STEP, ScalingPlan, ScalingSettings, Training
 from wiw.training.decision_errors import DecisionErrors, measure_decisions
 from wiw.training.held_out_clips import Frames, Imagine, imagine_with, measure_clips
@@ -117,6 +117,7 @@ class TrainingJob:
 
         Raises:
             FileError: the folder cannot be written, or a file of it is damaged.
+            DeviceMemoryError: memory does not suffice.
             TrainingError: the loss is not finite.
         """
         began, learner = time.monotonic(), make_learner(self.training.model)
@@ -129,7 +130,7 @@ class TrainingJob:
         found = {
             **self._card,
             "seconds": time.monotonic() - began,
-            "device": describe_device(self.device),
+            "device": model.card.get("device"),
             "measures": measures,
         }
         with atomic_file(self._measures) as draft:
@@ -145,16 +146,18 @@ class TrainingJob:
         recipe = create_recipe(learner, settings, own.clips, own.seed)
         rows = material.select_rows(own).tolist()
         checkpoint = Checkpoint(self.weights.with_suffix(".checkpoint"), self._card, SAVED_EVERY)
-        trainer, _ = run_training(
-            lambda: learner.trainer(SelectedClips(material.clips, rows), material.frames, recipe, self.device),
-            recipe,
-            own.updates,
-            None,
-            recipe.scale_rate,
-            lambda *_: None,
-            checkpoint,
-        )
-        learner.save(self.weights, trainer.network, {**self._card, "recipe": recipe.describe()})
+        with memory_guard(f"training {own.name} on {self.device}", "use fewer --workers, or --device cpu"):
+            trainer, _ = run_training(
+                lambda: learner.trainer(SelectedClips(material.clips, rows), material.frames, recipe, self.device),
+                recipe,
+                own.updates,
+                None,
+                recipe.scale_rate,
+                lambda *_: None,
+                checkpoint,
+            )
+        how = {"recipe": recipe.describe(), "device": describe_device(self.device)}
+        learner.save(self.weights, trainer.network, {**self._card, **how})
         checkpoint.remove()
 
     @property

@@ -85,8 +85,8 @@ def train_on_clips(
 
     Raises:
         ArgumentError: an unknown model or device; a dataset of perspective views, of scenes for evaluation or, for
-            warpnet, without depth; too few clips; a state of a training with other data or numbers; or validation on
-            scenes that are trained on or not there.
+            warpnet, without depth; too few clips; a state of a training with other data or numbers; or validation or
+            decisions on scenes that are trained on or not there.
         TrainingError: the loss is not finite; the last good state is kept, the message names the batch.
         FileError: the dataset is missing or damaged, or a file cannot be written.
         DeviceMemoryError: memory does not suffice.
@@ -113,10 +113,11 @@ def train_on_clips(
     card |= {"validated_on": checked.identity if checked else None}
     if (finished := _read_finished(learner, out, card)) is not None:
         return finished
-    trainer = learner.trainer(clips, reduce_frames(dataset, recipe.clip_size, cache, bar), recipe, device)
+    frames = reduce_frames(dataset, recipe.clip_size, cache, bar)
     state = SignalledCheckpoint(out.with_name(f"{out.name}.checkpoint"), {"model": name, **card}, seconds)
     remedies = f"lower batch (now {recipe.batch}), or choose a smaller size or network"
     with memory_guard(f"training {name} on {device}", remedies):
+        trainer = learner.trainer(clips, frames, recipe, device)
         validated = train_and_validate(
             trainer,
             create_sampler(learner, trainer),

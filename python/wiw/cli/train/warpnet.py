@@ -47,7 +47,7 @@ def train_warpnet(
     next to copy and warp. The weights shipped with wiw were trained by this command with its defaults.
 
     With --data, it trains on the clips of a dataset instead, in the order that post-training uses: validated on scenes
-    that are left out, resumed exactly when the command is repeated, and with a log beside FILE.
+    that are left out, resumed when the command is repeated (on the CPU exactly), and with a log beside FILE.
 
     Args:
         out: File for the weights (safetensors).
