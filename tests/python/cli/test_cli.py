@@ -154,8 +154,10 @@ def test_episodes_are_written_and_run_from_the_file(tmp_path, two_rooms, short, 
     assert "two_rooms.obj: no such file" in capsys.readouterr().err
     assert main([*command, "--episode-file", "e.json.gz", "--scene-folder", "moved", "--out", "found"]) == 0
     assert load_run("found").store.episodes() == task.episodes(2)
-    assert main(["episodes", "imagenav", "--scenes", "moved/two_rooms.obj", *options, "--out", "no/where.json"]) == 2
+    again = ["episodes", "imagenav", "--scenes", "moved/two_rooms.obj", *options]
+    assert main([*again, "--out", "moved/e.json.gz/below-a-file.json"]) == 2
     assert "cannot be written" in capsys.readouterr().err
+    assert main([*again, "--out", "new/folder/e.json"]) == 0 and Path("new/folder/e.json").exists()
 
 
 def test_per_scene_is_an_option(tmp_path, two_rooms, short):

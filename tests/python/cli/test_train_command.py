@@ -71,7 +71,7 @@ def test_numbers_out_of_range_are_refused(
         ("warpnet", "--gpus", "2"),
         ("armnet", "--places", "3"),
         ("armnet", "--scenes", "apartments:train:1"),
-        ("pocket", "--device", "cuda"),
+        ("armnet", "--device", "cuda"),
         ("diffuser", "--workers", "3"),
         ("diffuser", "--cache", "c"),
         ("ltx-action", "--minutes", "3"),
