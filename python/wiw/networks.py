@@ -7,8 +7,12 @@ import os
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 from wiw.errors import ArgumentError, DeviceMemoryError, WeightsError
+
+if TYPE_CHECKING:
+    import torch
 
 NETWORK_ERRORS = {"ConnectionError", "TransportError"}
 """Names of network errors in `requests` and `httpx`; the hub's client has used either."""
@@ -48,6 +52,14 @@ def has_bfloat16() -> bool:
     import torch
 
     return bool(torch.ops.mkldnn._is_mkldnn_bf16_supported())
+
+
+def autocast_bfloat16(device: str, wanted: bool) -> torch.autocast:
+    """Return a context that computes products in bfloat16 if `wanted`, on a CPU only where that is faster."""
+    import torch
+
+    kind = torch.device(device).type
+    return torch.autocast(kind, torch.bfloat16, enabled=wanted and (kind != "cpu" or has_bfloat16()))
 
 
 OUT_OF_MEMORY_WORDS = ("out of memory", "ALLOC_FAILED", "can't allocate memory")

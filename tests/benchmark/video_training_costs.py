@@ -94,7 +94,7 @@ class TrainingCost:
     billions: float
     """Parameters of the denoiser in training, its LoRA and its action encoder included."""
     billions_trained: float
-    """Those of them that are trained."""
+    """The trained ones among them."""
     precisions: dict[str, str]
     passes: int
     passes_timed: int
@@ -107,7 +107,7 @@ class TrainingCost:
     seconds_timed: list[float]
     """The timed steps after it."""
     seconds_per_pass: float
-    """Of `rows` clips, loading and encoding included; mean."""
+    """Mean over passes of `rows` clips, loading and encoding included."""
     seconds_per_update: float
     """Clipping the gradient and the optimiser's step: a timed step less its passes; mean."""
     seconds_per_step: float
@@ -116,7 +116,7 @@ class TrainingCost:
     """Predicted: that step over its clips."""
     clips_per_hour: float
     loss: float
-    """Of the last step."""
+    """Loss of the last step."""
     gigabytes: float | None
     """Most memory of the GPU in tensors while it encodes and trains, weights included."""
     gigabytes_reserved: float | None

@@ -94,9 +94,20 @@ def load_decisions(path: str | Path) -> Decisions:
         DependencyError: pyarrow is not installed.
         FileError: there is no such file, or it is damaged.
     """
-    require_pyarrow("stored decisions")
-    file = RowGroupFile(Path(path), FORMAT, "stored decisions")
+    file = _open(path)
     return join_decisions([_read_decision(file, index) for index in range(len(file))])
+
+
+def read_scenes(path: str | Path) -> list[str]:
+    """Read the scene of each decision, and none of their pictures.
+
+    Raises:
+        DependencyError: pyarrow is not installed.
+        FileError: there is no such file, or it is damaged.
+    """
+    file = _open(path)
+    with file.blame_damage():
+        return [file.read(index, ["scene"])["scene"][0].as_py() for index in range(len(file))]
 
 
 def digest_decisions(path: str | Path) -> str:
@@ -109,6 +120,11 @@ def digest_decisions(path: str | Path) -> str:
         return hash_file(Path(path))
     except OSError as error:
         raise FileError(f"{path}: expected a file of `wiw collect decisions`, got {error}") from error
+
+
+def _open(path: str | Path) -> RowGroupFile:
+    require_pyarrow("stored decisions")
+    return RowGroupFile(Path(path), FORMAT, "stored decisions")
 
 
 def _build_tables(decisions: Decisions, schema: Any) -> Iterator[Any]:

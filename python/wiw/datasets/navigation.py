@@ -15,7 +15,7 @@ from __future__ import annotations
 import json
 from bisect import bisect_right
 from collections import Counter
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from hashlib import blake2b, sha256
 from itertools import accumulate
 from pathlib import Path
@@ -25,6 +25,7 @@ from wiw.datasets.navigation_card import build_card
 from wiw.datasets.navigation_files import FORMAT, SEGMENTS, FrameFile, read_segment_list
 from wiw.datasets.navigation_segment import NavigationSegment
 from wiw.datasets.parquet_files import MANIFEST, require_pyarrow
+from wiw.datasets.scene_splits import name_scene
 from wiw.errors import ArgumentError, FileError
 from wiw.files import atomic_file
 from wiw.mapping_files import read_json_object
@@ -91,6 +92,16 @@ class NavigationData(Sequence[NavigationSegment]):
         if row["file"] not in self._files:
             self._files[row["file"]] = FrameFile(self.folder / row["file"])
         return self._files[row["file"]].read_segment(row["row_group"], pictures)
+
+    @property
+    def scenes(self) -> set[str]:
+        """Names of its scenes, without their edits: an edited apartment is the same home."""
+        return {strip_edits(row["scene"]) for row in self.segments}
+
+    def find_shared(self, specs: Iterable[str]) -> str | None:
+        """Return the first of some scenes that is in the dataset too, whatever its edits; None if none is."""
+        own = self.scenes
+        return next((spec for spec in specs if strip_edits(name_scene(spec)) in own), None)
 
     @property
     def frames(self) -> int:

@@ -18,7 +18,6 @@ from wiw.datasets.navigation_segment import NavigationSegment, describe_segment
 from wiw.datasets.parquet_files import hash_file
 from wiw.datasets.scene_splits import list_evaluation_scenes
 from wiw.errors import FileError
-from wiw.scenes import strip_edits
 
 STEP_TOLERANCE = 0.011
 """Metres: a step's end is moved onto the mesh by up to a centimetre."""
@@ -131,7 +130,7 @@ def _check_leaks(datasets: Sequence[NavigationData], found: Verification) -> Non
     """Look for scenes that two datasets share; an edited apartment counts as the one it is a copy of."""
     owners: dict[str, NavigationData] = {}
     for data in datasets:
-        for scene in sorted({strip_edits(row["scene"]) for row in data.segments}):
+        for scene in sorted(data.scenes):
             other = owners.setdefault(scene, data)
             if other is not data:
                 found.add("leak", f"{scene} is in {other.folder} and in {data.folder}")

@@ -275,8 +275,7 @@ def _open_cells(grid: OccupancyGrid, pose: NDArray[np.float64], squeeze: bool = 
     With `squeeze` those are all that are free, else only those with no obstacle right beside them.
     """
     ((row,), (column,)) = grid.to_cells(pose[None, :2])
-    reach = int(START_RADIUS / CELL)
-    window = slice(max(0, row - reach), row + reach + 1), slice(max(0, column - reach), column + reach + 1)
+    window = _cut_window(row, column, START_RADIUS)
     size = (1, 1) if squeeze else (3, 3)
     near = cv2.dilate(grid.occupied.view(np.uint8), cv2.getStructuringElement(cv2.MORPH_CROSS, size))
     open_ = grid.standable.copy()
@@ -289,13 +288,18 @@ def _open_cells(grid: OccupancyGrid, pose: NDArray[np.float64], squeeze: bool = 
 
 def _find_way_off(grid: OccupancyGrid, row: int, column: int) -> NDArray[np.bool_]:
     """Return the cells over which an agent leaves what it stands on: the thing close around a cell, and its rim."""
-    reach = int(TOP_RADIUS / CELL)
-    window = slice(max(0, row - reach), row + reach + 1), slice(max(0, column - reach), column + reach + 1)
+    window = _cut_window(row, column, TOP_RADIUS)
     _, parts = cv2.connectedComponents((grid.occupied & ~grid.wall_cells)[window].view(np.uint8), connectivity=8)
     own = parts == parts[row - window[0].start, column - window[1].start]
     found = np.zeros_like(grid.occupied)
     found[window] = cv2.dilate(own.view(np.uint8), np.ones((5, 5), np.uint8)).view(bool)
     return np.asarray(found & grid.known & ~grid.wall_cells)
+
+
+def _cut_window(row: int, column: int, radius: float) -> tuple[slice, slice]:
+    """Return the rows and columns within so many metres of a cell."""
+    reach = int(radius / CELL)
+    return slice(max(0, row - reach), row + reach + 1), slice(max(0, column - reach), column + reach + 1)
 
 
 def _find_cell(grid: OccupancyGrid, pose: NDArray[np.float64]) -> tuple[int, int]:

@@ -118,13 +118,13 @@ def measure_camera_height(depth: NDArray[np.float32]) -> float:
     """
     if depth.shape[0] < LEAST_ROWS:
         return CAMERA_HEIGHT
-    rays, below = _get_rays_below(depth.shape[0])
-    seen = depth[below, LEVEL_STRIDE // 2 :: LEVEL_STRIDE].astype(np.float64)
-    level, flat = seen * rays.drop, seen * rays.cosine
+    rows, down, away = _get_rays_below(depth.shape[0])
+    seen = depth[rows, LEVEL_STRIDE // 2 :: LEVEL_STRIDE].astype(np.float64)
+    level, flat = seen * down, seen * away
     found = (seen > 0) & (flat < LEVEL_REACH) & (level > LEVELS[0]) & (level < LEVELS[1])
     if not found.any():
         return CAMERA_HEIGHT
-    level, area = level[found], (seen * flat / rays.drop)[found]  # of a level surface, by solid angle
+    level, area = level[found], (seen * flat / down)[found]  # of a level surface, by solid angle
     steps = (level / LEVEL_STEP).astype(np.intp)
     totals = np.convolve(np.bincount(steps, area), np.ones(3), "same")  # a level may lie at the edge of two steps
     near = np.abs(steps - totals.argmax()) <= 1
@@ -132,22 +132,12 @@ def measure_camera_height(depth: NDArray[np.float32]) -> float:
     return height if height > CAMERA_HEIGHT + 2 * LEVEL_STEP else CAMERA_HEIGHT
 
 
-@dataclass(frozen=True)
-class _RaysBelow:
-    """Rays of a panorama's rows below the horizon, each [R, 1]."""
-
-    drop: NDArray[np.float64]
-    """Metres down per metre along the ray."""
-    cosine: NDArray[np.float64]
-    """Metres away on the floor plan per metre along the ray."""
-
-
 @lru_cache(maxsize=8)
-def _get_rays_below(height: int) -> tuple[_RaysBelow, NDArray[np.intp]]:
-    """Return the rays of the measured rows below the horizon, and the rows."""
+def _get_rays_below(height: int) -> tuple[NDArray[np.intp], NDArray[np.float64], NDArray[np.float64]]:
+    """Return the measured rows below the horizon, [R], and how far their rays lead down and away per metre, [R, 1]."""
     rows = np.arange(height // 2 + LEVEL_STRIDE // 2, height, LEVEL_STRIDE)
     pitch = np.pi * ((rows + 0.5) / height - 0.5)
-    return _RaysBelow(np.sin(pitch)[:, None], np.cos(pitch)[:, None]), rows
+    return rows, np.sin(pitch)[:, None], np.cos(pitch)[:, None]
 
 
 def unproject(views: Views, view: NDArray[np.intp], rows: NDArray[np.intp], columns: NDArray[np.intp]) -> NDArray[Any]:

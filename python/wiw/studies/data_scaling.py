@@ -20,11 +20,10 @@ import numpy as np
 from wiw.analysis.data_scaling import ScalingTable, Success, summarise_scaling
 from wiw.datasets.decisions import save_decisions
 from wiw.datasets.navigation import NavigationData
-from wiw.datasets.scene_splits import name_scene
 from wiw.errors import ArgumentError, FileError
 from wiw.files import atomic_file
 from wiw.networks import resolve_device
-from wiw.scenes import resolve, strip_edits
+from wiw.scenes import resolve
 from wiw.studies.data_scaling_plan import (
     FULL,
     PRIMARY,
@@ -191,8 +190,7 @@ def _require_unseen(decision_scenes: str, trained: NavigationData) -> None:
     Raises:
         ArgumentError: names such a scene.
     """
-    names = {strip_edits(row["scene"]) for row in trained.segments}
-    seen = next((spec for spec in resolve(decision_scenes) if strip_edits(name_scene(spec)) in names), None)
+    seen = trained.find_shared(resolve(decision_scenes))
     if seen is not None:
         raise ArgumentError(
             f"data-scaling: expected decisions in scenes that are not trained on, got {seen}; choose others "

@@ -92,7 +92,7 @@ class TrainingJob:
     data: Path
     folder: Path
     device: str = "cpu"
-    """Of torch, for the training; the model is measured on the CPU."""
+    """Torch device of the training; the model is measured on the CPU."""
 
     @property
     def weights(self) -> Path:

@@ -18,7 +18,7 @@ from torch.nn import functional
 
 from wiw._core import core
 from wiw.errors import ArgumentError
-from wiw.networks import has_bfloat16, single_thread
+from wiw.networks import autocast_bfloat16, single_thread
 from wiw.policies.matcher import appearance
 from wiw.policies.navigator.bands import BAND_ROWS, GOAL_COLUMNS, GOAL_WIDTH, WIDTH, get_goal_mask
 from wiw.policies.navigator.estimator import GoalEstimator, PlaceEstimates
@@ -170,7 +170,7 @@ class _Trainer(ResumableTrainer):
         chosen = rng.integers(0, len(self.scenes), recipe.scenes)
         batches = [sample_pairs(self.scenes[i], recipe, rng) for i in chosen]
         network = self.network.train()
-        with torch.autocast("cpu", torch.bfloat16, enabled=recipe.bfloat16 and has_bfloat16()):
+        with autocast_bfloat16("cpu", recipe.bfloat16):
             places = network.encode(torch.cat([batch.places for batch in batches]))
             goals = network.encode(torch.cat([batch.goals for batch in batches]))
             found = [

@@ -16,7 +16,7 @@ from torch.nn import functional
 
 from wiw._core import core
 from wiw.errors import ArgumentError
-from wiw.networks import has_bfloat16, resolve_device, single_thread
+from wiw.networks import autocast_bfloat16, resolve_device, single_thread
 from wiw.perception.labeller_weights import load, save
 from wiw.perception.labelling_network import FINE_CELLS, PIXELS, Network, Pointwise, fuse, group_cells
 from wiw.perception.learned_labeller import LearnedLabeller
@@ -192,8 +192,6 @@ class _Trainer(ResumableTrainer):
         parameters = [*self.network.parameters(), *self._auxiliary.parameters()]
         self._optimiser = torch.optim.AdamW(parameters, recipe.rate, weight_decay=recipe.decay)
         self._sampling_weights = compute_sampling_weights(views.category)
-        self._device_type = torch.device(device).type
-        self._bfloat16 = recipe.bfloat16 and (self._device_type != "cpu" or has_bfloat16())
         category_weights = _compute_category_weights(pairs.sum(axis=1), recipe.balance)
         self._category_weights = torch.from_numpy(category_weights).to(device)
         self._state_weights = torch.from_numpy(_compute_state_weights(pairs)).to(device)
@@ -225,7 +223,7 @@ class _Trainer(ResumableTrainer):
         batch = sample_batch(
             self.views, recipe.batch, recipe.imagined, self._sampling_weights, rng, self.device, coarse
         )
-        with torch.autocast(self._device_type, torch.bfloat16, enabled=self._bfloat16):
+        with autocast_bfloat16(self.device, self.recipe.bfloat16):
             features = self.network.train().compute_features(batch.shown)
             category_logits, state_logits = self.network.compute_logits(features[-1])
             coarser = [head(each) for head, each in zip(self._auxiliary, features[:-1], strict=True)]

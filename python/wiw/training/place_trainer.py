@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from torch import Tensor, nn
 
 from wiw.datasets.navigation import Clips, NavigationData, SelectedClips
-from wiw.networks import has_bfloat16
+from wiw.networks import autocast_bfloat16
 from wiw.training.post_training.clip_trainer import ClipTrainer, mix_seed, seed_torch
 from wiw.training.post_training.recipe import ClipRecipe
 from wiw.training.reduced_frames import ReducedFrames
@@ -63,9 +63,7 @@ class PlaceTrainer(ClipTrainer):
 
     def reduce_precision(self) -> torch.autocast:
         """Return a context that computes products in bfloat16, if the recipe says so and it is faster on the device."""
-        kind = self.device.type
-        wanted = self.recipe.precision == "bfloat16" and (kind != "cpu" or has_bfloat16())
-        return torch.autocast(kind, torch.bfloat16, enabled=wanted)
+        return autocast_bfloat16(self.device.type, self.recipe.precision == "bfloat16")
 
     def compute_losses(self, rows: NDArray[np.int64], random: torch.Generator) -> Tensor:
         """Return the loss of each clip."""

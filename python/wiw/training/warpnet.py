@@ -17,7 +17,7 @@ from wiw import metrics, scenes
 from wiw._core import core
 from wiw.datasets.worlds import world
 from wiw.errors import ArgumentError
-from wiw.networks import has_bfloat16
+from wiw.networks import autocast_bfloat16
 from wiw.reproject import pose, warp
 from wiw.training.gather import gather_walks, require_held_out
 from wiw.training.preparation import PREPARATION, Preparation, ProgressBar, show_no_bar
@@ -135,7 +135,7 @@ class _Trainer:
     def train_step(self, learning_rate: float) -> float:
         """Train on one batch of pairs and return its loss."""
         pairs = sample_pairs(self.walks, self.recipe.batch, self._rng)
-        with torch.autocast("cpu", torch.bfloat16, enabled=self.recipe.bfloat16 and has_bfloat16()):
+        with autocast_bfloat16("cpu", self.recipe.bfloat16):
             found = self.network.train()(pairs.source, pairs.ahead)
         loss = compute_losses(found, pairs, self.recipe).mean()
         loss.backward()

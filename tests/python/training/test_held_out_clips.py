@@ -12,7 +12,7 @@ import pytest
 import wiw
 from wiw import action
 from wiw.cli.app import main
-from wiw.datasets.decisions import Decisions, load_decisions, save_decisions
+from wiw.datasets.decisions import Decisions, load_decisions, read_scenes, save_decisions
 from wiw.datasets.worlds import world
 from wiw.errors import ArgumentError, FileError
 from wiw.metrics import psnr
@@ -144,12 +144,15 @@ def test_who_imagines_nothing_chooses_the_first(decisions: Decisions) -> None:
 def test_decisions_are_stored(decisions: Decisions, tmp_path: Path) -> None:
     save_decisions(tmp_path / "d.parquet", decisions)
     again = load_decisions(tmp_path / "d.parquet")
+    assert tuple(read_scenes(tmp_path / "d.parquet")) == again.scenes
     assert again.scenes == decisions.scenes
     for name in ("images", "goals", "plans", "futures", "distances"):
         np.testing.assert_array_equal(getattr(again, name), getattr(decisions, name))
     (tmp_path / "d.parquet").write_bytes(b"PAR1")
     with pytest.raises(FileError, match="damaged"):
         load_decisions(tmp_path / "d.parquet")
+    with pytest.raises(FileError):
+        read_scenes(tmp_path / "d.parquet")
 
 
 def test_rules_of_decisions_are_checked() -> None:

@@ -66,11 +66,9 @@ def train_and_measure(
 
 def _check_held_out(val: str, data: NavigationData) -> None:
     """Check that scenes exist and are not trained on; a dataset identifies its scenes only by name."""
-    from wiw.datasets.scene_splits import name_scene
-    from wiw.scenes import resolve, strip_edits
+    from wiw.scenes import resolve
 
-    trained = {strip_edits(row["scene"]) for row in data.segments}
-    shared = next((spec for spec in resolve(val) if strip_edits(name_scene(spec)) in trained), None)
+    shared = data.find_shared(resolve(val))
     if shared is not None:
         raise ArgumentError(
             f"--val: expected held-out scenes, got {shared}, but {data.folder} has a scene of that name to train on; "

@@ -78,8 +78,13 @@ def train_pocket(
         numbers = drop_none({"epochs": epochs, "seed": seed or None})
         options = {**numbers, **parse_options(option, PocketRecipe, "--option")}
         chosen = load_recipe("pocket", recipe, options, kind=PocketRecipe)
-        watched: dict[str, Any] = {"part": part, "validation": validation, "decisions": decisions}
-        watched |= {"tracker": tracker, "device": device}
+        watched: dict[str, Any] = {
+            "part": part,
+            "validation": validation,
+            "decisions": decisions,
+            "tracker": tracker,
+            "device": device,
+        }
         folder = require_data("pocket", data)
         card = train_and_measure(
             "pocket", out, folder, Preparation(cache=cache).folder, val, chosen, watched, held_out.evaluate

@@ -25,7 +25,6 @@ from wiw.datasets.navigation import META, Clips, NavigationData, Part, part_of
 from wiw.datasets.parquet_files import MANIFEST
 from wiw.datasets.scene_splits import list_evaluation_scenes
 from wiw.errors import ArgumentError, FileError
-from wiw.scenes import strip_edits
 from wiw.training.held_out_clips import HeldOutClips
 from wiw.training.held_out_demonstrations import DemonstratedPlan, select_demonstrations
 from wiw.training.held_out_panoramas import select_panoramas
@@ -179,8 +178,8 @@ class NavigationCorpus(Corpus):
 
     @property
     def units(self) -> set[str]:
-        """Names of the scenes, without their edits: an edited apartment is the same home."""
-        return {strip_edits(row["scene"]) for row in self.data.segments}
+        """Names of the scenes, without their edits."""
+        return self.data.scenes
 
     @property
     def camera_height(self) -> float | None:

@@ -14,7 +14,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from wiw.datasets.decisions import Decisions, digest_decisions, load_decisions
+from wiw.datasets.decisions import Decisions, digest_decisions, load_decisions, read_scenes
 from wiw.datasets.navigation import Part
 from wiw.errors import ArgumentError
 from wiw.files import atomic_file
@@ -132,7 +132,7 @@ def _require_unseen_decisions(decisions: str | Path | None, trained: AbstractSet
     """
     if decisions is None:
         return
-    seen = sorted(trained & {strip_edits(name) for name in load_decisions(decisions).scenes})
+    seen = sorted(trained & set(map(strip_edits, read_scenes(decisions))))
     if seen:
         raise ArgumentError(
             f"decisions: expected scenes that are not trained on, got {', '.join(seen[:3])}; collect decisions "
