@@ -36,6 +36,24 @@ inline void expect_shape(const py::array& array, std::initializer_list<py::ssize
   if (!fits) throw ArgumentError(std::string("expected ") + expected + ", got " + shape_text(array));
 }
 
+/// Integers of a Python value as an array of T. Throws ArgumentError for fractions and for numbers that T cannot hold,
+/// which a plain cast would change silently.
+template <class T>
+Array<T> to_integers(const py::handle& value, const char* expected) {
+  const auto given = py::array::ensure(value);
+  if (!given) throw ArgumentError(std::string("expected ") + expected + ", got no array");
+  if (given.size() > 0 && std::string("biu").find(given.dtype().kind()) == std::string::npos) {
+    throw ArgumentError(std::string("expected ") + expected + ", got " + shape_text(given));
+  }
+  auto converted = Array<T>::ensure(given);
+  if (given.dtype().is(converted.dtype())) return converted;
+  const auto equal = py::module_::import("numpy").attr("array_equal")(given, converted);
+  if (!equal.template cast<bool>()) {
+    throw ArgumentError(std::string("expected ") + expected + ", got numbers out of its range");
+  }
+  return converted;
+}
+
 /// float64 [B, 4, 4] (or [4, 4]) rigid transforms; checks shape, finiteness and the rotation.
 inline std::vector<Pose> to_poses(const Array<double>& matrices, const char* name) {
   const bool single = matrices.ndim() == 2;

@@ -251,8 +251,9 @@ py::array_t<float> select_on_mesh(const NavMesh& mesh, std::uint64_t seed, doubl
   return point_array(points, {static_cast<py::ssize_t>(points.size()), 3});
 }
 
-std::shared_ptr<NavMesh> from_triangles(const Array<float>& vertices, const Array<std::int64_t>& faces,
+std::shared_ptr<NavMesh> from_triangles(const Array<float>& vertices, const py::object& indices,
                                         const NavMeshSettings& settings) {
+  const auto faces = bindings::to_integers<std::int64_t>(indices, "faces int [F, 3]");
   bindings::expect_shape(vertices, {-1, 3}, "vertices [V, 3]");
   bindings::expect_shape(faces, {-1, 3}, "faces [F, 3]");
   const Points points = to_points(vertices, "vertices");

@@ -193,7 +193,9 @@ py::dict articulation_to_parts(const Articulation& articulation) {
   return parts;
 }
 
-ArticulationPtr articulation_from_parts(const py::dict& parts) {
+namespace {
+
+ArticulationPtr read_parts(const py::dict& parts) {
   std::vector<Link> links;
   std::vector<Joint> joints;
   for (const py::handle link : parts["links"]) links.push_back(link_of(link.cast<py::dict>()));
@@ -204,6 +206,21 @@ ArticulationPtr articulation_from_parts(const py::dict& parts) {
   check_tree(links, joints, limits);
   return std::make_shared<Articulation>(parts["name"].cast<std::string>(), std::move(links), std::move(joints),
                                         std::move(limits));
+}
+
+}  // namespace
+
+ArticulationPtr articulation_from_parts(const py::dict& parts) {
+  const std::string expected = "parts of an articulation: expected what `to_parts` gives; ";
+  try {
+    return read_parts(parts);
+  } catch (const py::error_already_set& error) {  // a key or an element that is missing
+    if (!error.matches(PyExc_LookupError) && !error.matches(PyExc_TypeError)) throw;
+    throw ArgumentError(expected + py::str(error.type().attr("__name__")).cast<std::string>() + ": " +
+                        py::str(error.value()).cast<std::string>());
+  } catch (const py::cast_error&) {  // a value of another kind
+    throw ArgumentError(expected + "a value is of another kind");
+  }
 }
 
 }  // namespace wiw::bindings

@@ -9,6 +9,7 @@
 #include <initializer_list>
 #include <map>
 #include <tuple>
+#include <type_traits>
 #include <vector>
 
 #include "arrays.hpp"
@@ -25,7 +26,12 @@ template <class T, int N>
 std::vector<Eigen::Matrix<T, N, 1>> rows(const py::dict& dict, const char* key, const char* expected) {
   std::vector<Eigen::Matrix<T, N, 1>> result;
   if (!dict.contains(key) || dict[key].is_none()) return result;
-  const auto array = dict[key].cast<Array<T>>();
+  Array<T> array;
+  if constexpr (std::is_integral_v<T>) {
+    array = to_integers<T>(dict[key], expected);
+  } else {
+    array = dict[key].cast<Array<T>>();
+  }
   expect_shape(array, {-1, N}, expected);
   result.resize(static_cast<std::size_t>(array.shape(0)));
   if (!result.empty()) std::memcpy(static_cast<void*>(result.data()), array.data(), result.size() * sizeof(result[0]));
@@ -46,7 +52,7 @@ void check_keys(const py::dict& dict, std::initializer_list<const char*> known, 
 }
 
 scene::Texture texture_from(const py::handle& value, std::size_t index) {
-  const auto array = value.cast<Array<std::uint8_t>>();
+  const auto array = to_integers<std::uint8_t>(value, "a texture uint8 [H, W, 4]");
   expect_shape(array, {-1, -1, 4}, "a texture uint8 [H, W, 4]");
   const Size size{static_cast<int>(array.shape(0)), static_cast<int>(array.shape(1))};
   std::vector<std::uint8_t> rgba(array.data(), array.data() + array.size());
@@ -145,7 +151,7 @@ scene::Room room_from(const py::dict& dict) {
 
 std::vector<scene::LabelledPiece> pieces_from(const py::array& labels, const py::object& triangles,
                                               const py::object& corners) {
-  const auto instances = labels.cast<Array<std::uint32_t>>();
+  const auto instances = to_integers<std::uint32_t>(labels, "labels uint32 [P]");
   expect_shape(instances, {-1}, "labels uint32 [P]");
   std::vector<scene::LabelledPiece> pieces(static_cast<std::size_t>(instances.size()));
   for (std::size_t i = 0; i < pieces.size(); ++i) {
@@ -153,7 +159,7 @@ std::vector<scene::LabelledPiece> pieces_from(const py::array& labels, const py:
     pieces[i].instance = instances.data()[i];
   }
   if (!triangles.is_none()) {
-    const auto numbers = triangles.cast<Array<std::uint32_t>>();
+    const auto numbers = to_integers<std::uint32_t>(triangles, "triangles uint32 [P], one for each label");
     expect_shape(numbers, {instances.size()}, "triangles uint32 [P], one for each label");
     for (std::size_t i = 0; i < pieces.size(); ++i) pieces[i].triangle = numbers.data()[i];
   }

@@ -37,6 +37,14 @@ def resolve_device(name: str | None) -> str:
             f"device: torch sees {torch.cuda.device_count()} CUDA devices, so there is no '{name}'; check the driver "
             f"(nvidia-smi) and that torch {torch.__version__} is a CUDA build, or use device='cpu'"
         )
+    try:
+        if asked.type not in ("cpu", "cuda"):  # other back ends are asked: torch.device knows their names everywhere
+            torch.empty(1, device=asked)
+    except (RuntimeError, AssertionError, ImportError) as error:
+        raise ArgumentError(
+            f"device: torch {torch.__version__} cannot use '{name}' on this machine; leave the device out, or use "
+            "device='cpu'"
+        ) from error
     return name
 
 

@@ -209,10 +209,23 @@ struct InverseKinematics::Search {
   int iterations = 0;
 };
 
+void IkOptions::validate() const {
+  if (!(position_tolerance > 0) || !(rotation_tolerance > 0)) {
+    throw ArgumentError("inverse kinematics: expected positive tolerances, got position_tolerance=" +
+                        std::to_string(position_tolerance) +
+                        ", rotation_tolerance=" + std::to_string(rotation_tolerance));
+  }
+  if (iterations < 1 || restarts < 0) {
+    throw ArgumentError("inverse kinematics: expected iterations of 1 or more and restarts of 0 or more, got " +
+                        std::to_string(iterations) + " and " + std::to_string(restarts));
+  }
+}
+
 IkResult InverseKinematics::solve(const Pose& T_base_link, const Eigen::VectorXd& start,
                                   const IkOptions& options) const {
   check_pose(T_base_link, "T_base_link");
   articulation_->check_positions(start, "start");
+  options.validate();
   Search search(*this, T_base_link, options);
   const bool near = (T_base_link.translation() - chain_[0].before.translation()).norm() <= reach_;
   const int attempts = near ? options.restarts + 1 : 1;

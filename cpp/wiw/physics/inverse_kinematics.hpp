@@ -14,6 +14,8 @@ struct IkOptions {
   int iterations = 60;               // of one attempt, at most
   int restarts = 30;                 // from random joint positions, after the attempt from `start`
   std::uint64_t seed = 0;
+
+  void validate() const;  // ArgumentError for tolerances that are not positive, and for negative counts
 };
 
 enum class IkReason { kReached, kOutOfReach, kJointLimits, kNotConverged };

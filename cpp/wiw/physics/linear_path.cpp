@@ -26,13 +26,20 @@ Pose between(const Pose& from, const Pose& to, double share) {
   return pose;
 }
 
+constexpr double kMostSegments = 1e6;
+
 int segments(const Pose& from, const Pose& to, const LinearPathOptions& options) {
-  if (!(options.step > 0) || !(options.angle_step > 0)) {
-    throw ArgumentError("expected a positive step and angle_step of the path");
+  if (!(options.step > 0) || !(options.angle_step > 0) || !(options.tolerance >= 0)) {
+    throw ArgumentError("expected a positive step and angle_step of the path, and a tolerance of 0 or more, got step=" +
+                        std::to_string(options.step) + ", angle_step=" + std::to_string(options.angle_step) +
+                        ", tolerance=" + std::to_string(options.tolerance));
   }
   const double length = (to.translation() - from.translation()).norm();
   const double angle = Eigen::Quaterniond(from.linear()).angularDistance(Eigen::Quaterniond(to.linear()));
-  return std::max(1, static_cast<int>(std::ceil(std::max(length / options.step, angle / options.angle_step) - 1e-9)));
+  const double count = std::ceil(std::max(length / options.step, angle / options.angle_step) - 1e-9);
+  if (count > kMostSegments)
+    throw ArgumentError("expected a path of at most a million waypoints; make its steps longer");
+  return std::max(1, static_cast<int>(count));
 }
 
 }  // namespace
@@ -86,6 +93,7 @@ LinearPath plan_linear(World& world, int articulation, int link, const Pose& T_w
 
 bool follow(World& world, int articulation, const LinearPath& path, double speed, double tolerance, int settle) {
   if (!(speed > 0 && speed <= 1)) throw ArgumentError("expected a speed in (0, 1], got " + std::to_string(speed));
+  if (!(tolerance > 0)) throw ArgumentError("expected a positive tolerance, got " + std::to_string(tolerance));
   if (path.joints.empty()) return false;
   for (const Eigen::VectorXd& each : path.joints) world.articulation(articulation)->check_positions(each, "path");
   const Eigen::VectorXd& limit = world.articulation(articulation)->limits().velocity;

@@ -17,7 +17,7 @@ from wiw.loop.config import PlanConfig
 from wiw.runs.config import RunConfig
 
 Values = Annotated[str | None, arg(metavar="A,B,...")]
-AGENT, TASK, SEARCH, SETTINGS = AgentFlags(world_model="warp"), TaskFlags(), PlanConfig(), RunConfig()
+AGENT, TASK, SEARCH, SETTINGS = AgentFlags(world_model="warp"), TaskFlags(), PlanConfig(), RunConfig(keep_images=0)
 """The defaults of the command line."""
 
 
@@ -55,12 +55,12 @@ def scale(
     seed = config.seed or 0
     recipe, agent = rules.make_recipe(task, seed), parts.make_recipe(task, rules.preset, search)
     folder = Path(config.out or Path("runs") / f"scale-{datetime.now():%Y%m%d-%H%M%S}")
-    settings = replace(config, seed=seed, out=folder)
+    settings, kept = replace(config, seed=seed, out=folder), config.keep_images
     counts, shares = (
         parse_numbers(candidates, int, "candidates"),
         parse_numbers(imagine_fraction, float, "imagine-fraction"),
     )
-    found = stoppable(lambda: run_scale(recipe, agent, counts, shares, config=settings), folder)
+    found = stoppable(lambda: run_scale(recipe, agent, counts, shares, config=settings, keep_images=kept), folder)
     found.summary()
     for path in found.save():
         print(path)

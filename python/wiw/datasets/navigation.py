@@ -211,6 +211,7 @@ def read_meta(folder: Path) -> dict[str, Any]:
     """
     path = folder / META
     if not path.exists() and (folder / MANIFEST).exists():
+        read_navigation_manifest(folder)  # demonstrations have a manifest of their own, and no meta.json
         raise FileError(
             f"{path} is missing; `wiw collect navigation` writes it at the end: repeat that command until it finishes"
         )
@@ -254,5 +255,6 @@ def read_navigation_manifest(folder: Path) -> dict[str, Any]:
     path = folder / MANIFEST
     found = read_json_object(path, "a new folder, or one that `wiw collect navigation` has started")
     if found.get("what") != "navigation":
-        raise FileError(f"{path}: expected a manifest of `wiw collect navigation`, got one of {found.get('what')}")
+        other = "`wiw collect manipulation`" if "tasks" in found else found.get("what")
+        raise FileError(f"{path}: expected a manifest of `wiw collect navigation`, got one of {other}")
     return found

@@ -11,6 +11,7 @@ from __future__ import annotations
 import heapq
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from math import floor
 from typing import Any
 
 import cv2
@@ -179,7 +180,7 @@ def _search(
     x, y = float(pose[0]), float(pose[1])
 
     def cell(x: float, y: float) -> int:
-        return (int(x // CELL) - origin_x) * width + int(y // CELL) - origin_y
+        return (floor(x / CELL) - origin_x) * width + floor(y / CELL) - origin_y
 
     first = cell(x, y)
     best = {(first, 0): 0.0}

@@ -484,7 +484,9 @@ def _name_own_arm(agent: Any, recipe: AgentRecipe | AgentInMemory) -> str:
     """Return the name of an agent's own model: a recipe's as its user writes it, else its class behind all wrappers."""
     if isinstance(agent, Agent):
         return "none" if agent.model is None else type(agent.model.unwrapped).__name__.lower()
-    return recipe.arm if isinstance(recipe, AgentRecipe) else "none"
+    if not isinstance(recipe, AgentRecipe):
+        return "none"
+    return _add_changes(recipe.arm, recipe.placebo, recipe.error, recipe.reseed is not None)
 
 
 def _make_arm(agent: AgentRecipe, name: str | None, model: Any) -> tuple[str, AgentRecipe]:
@@ -582,11 +584,16 @@ def _name_arm(policy: str | None, model: str, repeats: bool) -> str:
     kind, named = placebo_of(model)
     error, named = (None, named) if kind is not None else error_of(model)
     short = AgentRecipe("", None if named in ("none", None) else named).arm
-    if kind is not None or error is not None:
-        short = f"{f'{ERROR}{error}' if kind is None else f'{PLACEBO}{kind}'}{f':{short}' if named else ''}"
-    if repeats:
-        short = f"{RESEEDED}:{short}"
+    short = _add_changes(short if named else "", kind, error, repeats)
     return short if policy is None else policy if model == "none" and not repeats else f"{policy}+{short}"
+
+
+def _add_changes(model: str, placebo: str | None, error: str | None, repeats: bool) -> str:
+    """Return an arm's name: a model's, with what is done to the model in front; an empty one is left out."""
+    changes = [RESEEDED] if repeats else []
+    changes += [] if placebo is None else [f"{PLACEBO}{placebo}"]
+    changes += [] if error is None else [f"{ERROR}{error}"]
+    return ":".join([*changes, *([model] if model else [])])
 
 
 def placebo_of(arm: str) -> tuple[str | None, str | None]:

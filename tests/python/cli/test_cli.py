@@ -18,6 +18,7 @@ from wiw.cli.flag_help import read_flags
 from wiw.cli.options import parse_options
 from wiw.cli.parts import AgentFlags
 from wiw.errors import ArgumentError
+from wiw.runs.pictures import choose_pictured_episodes
 from wiw.scenes.scans import formats
 from wiw.studies.run_log import load_run
 from wiw.tasks.imagenav import ImageNav
@@ -249,7 +250,10 @@ def test_scaling_and_episodes_take_a_tasks_options_too(tmp_path, two_rooms, shor
     task = ["scale", "imagenav", "--scenes", two_rooms, "--preset", short, "--episodes", "1", "--candidates", "1"]
     options = ["--task-option", "radius=9", "--world-model", "copy", "--out", str(tmp_path / "run")]
     assert main([*task, *options]) == 0
-    assert load_run(tmp_path / "run").store.config["task"]["radius"] == 9.0
+    run_store = load_run(tmp_path / "run").store
+    assert run_store.config["task"]["radius"] == 9.0 and not choose_pictured_episodes(run_store)
+    pictured = [*options[:-1], str(tmp_path / "pictured"), "--keep-images", "2"]
+    assert main([*task, *pictured]) == 0 and choose_pictured_episodes(load_run(tmp_path / "pictured").store)
     table = ["scale", "manipulation", "--tasks", "push_buttons", "--world-model", "copy", "--episodes", "1"]
     (tmp_path / "notes.txt").write_text("mine")
     assert main([*table, "--policy-option", "turned=1", "--out", str(tmp_path)]) == 2

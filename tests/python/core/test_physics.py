@@ -139,6 +139,20 @@ def test_inverse_kinematics_says_why_not() -> None:
             ik(bad, PANDA_READY)
     with pytest.raises(ArgumentError, match="panda_hand_tcp"):
         InverseKinematics(panda(), "panda_toe")
+    for odd in ({"position_tolerance": np.nan}, {"rotation_tolerance": 0}, {"iterations": 0}, {"restarts": -1}):
+        with pytest.raises(ArgumentError, match="inverse kinematics: expected"):
+            ik(place(0.5, 0, 0.3, rpy=DOWN), PANDA_READY, **odd)
+
+
+def test_paths_of_impossible_numbers_are_refused() -> None:
+    world, target = table_and_arm(), place(0.5, 0.25, 0.3, rpy=DOWN)
+    for odd in ({"step": np.nan}, {"angle_step": 0}, {"tolerance": np.nan}, {"step": 1e-300}):
+        with pytest.raises(ArgumentError, match="expected a p"):
+            world.plan_linear(target, PANDA_TCP, **odd)
+    path = world.plan_linear(target, PANDA_TCP)
+    for odd in ({"speed": np.nan}, {"tolerance": np.nan}):
+        with pytest.raises(ArgumentError, match="expected a "):
+            world.follow(path, **odd)
 
 
 def test_a_straight_path_is_straight() -> None:

@@ -22,6 +22,7 @@ from wiw.datasets.navigation_check import verify_datasets
 from wiw.datasets.navigation_files import SEGMENTS, build_table, navigation_schema, write_frames, write_segment_list
 from wiw.datasets.navigation_segment import NavigationSegment, encode_color
 from wiw.datasets.navigation_statistics import compute_statistics
+from wiw.errors import FileError
 from wiw.training.collect_navigation import collect_navigation, describe_data
 from wiw.training.navigation_estimate import estimate_collection
 from wiw.training.navigation_recording import NavigationCollection
@@ -151,6 +152,12 @@ def test_damaged_missing_and_foreign_files_are_found(copied: Path) -> None:
     assert any("SHA-256" in each for each in messages) and any("is not listed" in each for each in messages)
     path.unlink()
     assert any("No such file" in each for each in verify_datasets([copied]).problems["file"])
+
+
+def test_demonstrations_are_named_where_navigation_is_expected(tmp_path: Path) -> None:
+    (tmp_path / "manifest.json").write_text(json.dumps({"tasks": ["push_buttons"], "episodes": 2}))
+    with pytest.raises(FileError, match="of `wiw collect navigation`, got one of `wiw collect manipulation`"):
+        NavigationData(tmp_path)
 
 
 def test_datasets_that_share_a_scene_leak(collected: Path, copied: Path, tmp_path: Path, two_rooms: str) -> None:

@@ -193,6 +193,12 @@ def test_what_placebo_arms_are_of() -> None:
     assert arm_recipes(AgentRecipe("matcher"), ["placebo-swapped"])["placebo-swapped"].model == "warp"
     built = arm_recipes(wiw.Agent("matcher", "copy"), ["placebo-shuffled"])["placebo-shuffled"].build(NOWHERE)
     assert built.describe()["placebo"] == "shuffled" and type(built.model.unwrapped).__name__ == "Copy"
+    own = [AgentRecipe("matcher", "oracle", error="blur@16"), AgentRecipe("matcher", "copy", placebo="swapped")]
+    assert [name for each in own for name in arm_recipes(each, None)] == [
+        "error-blur@16:oracle",
+        "placebo-swapped:copy",
+    ]
+    assert list(arm_recipes(AgentRecipe("matcher", "copy", reseed=1), None)) == ["reseeded:copy"]
     assert absolute("placebo-shuffled:a.py:Mine").startswith("placebo-shuffled:/")
     for wrong in ("placebo-odd", "placebo-shuffled:none"):
         with pytest.raises(ArgumentError, match="placebo-shuffled"):

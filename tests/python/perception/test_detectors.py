@@ -164,6 +164,8 @@ def test_weights_that_do_not_do_are_refused(folders: dict[str, Path], tmp_path: 
         SEGMENTERS.make("sam2", weights=folders["sam2"], revision="main")
     with pytest.raises(ArgumentError, match="device: expected a torch device"):
         SEGMENTERS.make("sam2", weights=folders["sam2"], device="gpu")
+    with pytest.raises(ArgumentError, match=r"device: torch .* cannot use 'hpu' on this machine"):
+        SEGMENTERS.make("sam2", weights=folders["sam2"], device="hpu")
 
 
 def test_a_folder_that_lacks_weights_is_refused(folders: dict[str, Path], tmp_path: Path) -> None:

@@ -28,7 +28,7 @@ from test_gltf import DATA, DRACO, compressed_bumps, draco_glb, save, save_compr
 
 import wiw
 from wiw import _core, process_limits, scenes
-from wiw.errors import Error, FileError, InfrastructureError
+from wiw.errors import ArgumentError, Error, FileError, InfrastructureError
 from wiw.physics import Articulation, read_surface
 from wiw.scenes import isolated
 from wiw.tabletop.robot import load_robot
@@ -375,6 +375,12 @@ def test_a_robot_from_another_process_is_the_same_to_the_last_bit(tmp_path: Path
     np.testing.assert_array_equal(here.forward_kinematics(q), there.forward_kinematics(q))
     with pytest.raises(Error, match="make no tree"):
         Articulation.from_parts({**here.to_parts(), "joints": []})
+    for missing in ({}, {**here.to_parts(), "limits": []}, {**here.to_parts(), "links": [{}]}):
+        with pytest.raises(ArgumentError, match="expected what `to_parts` gives; "):
+            Articulation.from_parts(missing)
+    for other in ({**here.to_parts(), "links": [3]}, {**here.to_parts(), "name": []}):
+        with pytest.raises(ArgumentError, match="expected what `to_parts` gives; "):
+            Articulation.from_parts(other)
 
 
 # ---- the importer's process

@@ -142,11 +142,28 @@ def test_from_arrays_places_and_reports() -> None:
         ({"positions": SQUARE * np.nan, "triangles": TWO}, "not finite"),
         ({"positions": SQUARE, "triangles": TWO, "material": 3}, "material is 3"),
         ({"positions": SQUARE, "triangles": TWO, "colour": 1}, "'colour' is no key of a mesh"),
+        ({"positions": SQUARE, "triangles": TWO + 0.5}, "triangles uint32 \\[T, 3\\], got \\[2, 3\\] float64"),
+        ({"positions": SQUARE, "triangles": TWO.astype(int) - 1}, "triangles uint32 .*, got numbers out of its range"),
+        (
+            {"positions": SQUARE, "triangles": TWO, "colors": np.full((4, 4), 0.5)},
+            "colors uint8 \\[V, 4\\], got \\[4, 4\\] float64",
+        ),
+        (
+            {"positions": SQUARE, "triangles": TWO, "colors": np.full((4, 4), 256)},
+            "colors uint8 .*, got numbers out of its range",
+        ),
     ],
 )
 def test_from_arrays_refuses_what_does_not_fit(mesh: dict[str, Any], message: str) -> None:
     with pytest.raises(ArgumentError, match=message):
         scenes.Scene.from_arrays([mesh])
+
+
+def test_from_arrays_takes_whole_numbers_of_any_type() -> None:
+    for kind in (np.int64, np.uint8, list):
+        triangles = TWO.tolist() if kind is list else TWO.astype(kind)
+        scene = scenes.Scene.from_arrays([{"positions": SQUARE, "triangles": triangles}])
+        np.testing.assert_array_equal(scene.world_triangles()[1], TWO)
 
 
 @pytest.mark.parametrize("kind", [".png", ".jpg"])

@@ -163,6 +163,13 @@ class VLM(Policy):
                 "policy vlm: expected shown strip or frames, and these or captions=False only for tasks "
                 f"{', '.join(VLM.tasks)}, got shown={shown}, captions={captions}"
             )
+        if not self.tracks and (
+            tracker not in (None, "frames") or tracker_options or rounds or answer_view != "observation"
+        ):
+            raise ArgumentError(
+                "policy vlm: tracker, tracker_options, rounds and answer_view are only for tasks that point a target "
+                "out in the view, such as ar; leave them out"
+            )
         _require_packages()
         self.prompts = Prompts(prompts)
         table = None if prices is None else Prices.load(prices)
