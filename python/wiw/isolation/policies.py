@@ -209,6 +209,7 @@ def _read_declaration(declared: Mapping[str, Any]) -> dict[str, Any]:
         "needs": tuple(map(str, declared["needs"])),
         "frames": _read_frames(**declared["frames"]),
         "default_revision": None if declared["default_revision"] is None else str(declared["default_revision"]),
+        "longest_decision": None if declared["longest_decision"] is None else int(declared["longest_decision"]),
     }
 
 
@@ -250,7 +251,7 @@ def load_policy(host: Host, name: str) -> dict[str, Any]:
 
 def _declare(thing: Any) -> dict[str, Any]:
     """Return what a class, or an instance, declares."""
-    names = ("space", "needs", "frames", "default_revision")
+    names = ("space", "needs", "frames", "default_revision", "longest_decision")
     defaults = {name: getattr(Policy, name) for name in names}
     found = {name: getattr(thing, name, default) for name, default in defaults.items()}
     declared = {name: defaults[name] if isinstance(value, property) else value for name, value in found.items()}

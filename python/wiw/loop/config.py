@@ -25,7 +25,8 @@ class PlanConfig:
     executed per decision, unless plans become shorter than that."""
     execute: Annotated[int | None, arg(metavar="N")] = None
     """Actions executed before the next decision; 0: the whole plan; negative: all of the plan's first `horizon` except
-    that many, but at least one. Default: the task's; L - 2 without a task."""
+    that many, but at least one. Default: the task's; L - 2 without a task. More than `horizon` matters only to policies
+    that decide on longer plans than are imagined."""
     depth: Annotated[int, arg(metavar="N")] = 1
     """Levels of the beam search. The first chooses among the proposals; each further level extends the best plans by
     `horizon` actions, proposed by `Policy.extend` from their imagined ends."""
@@ -56,9 +57,9 @@ class AgentConfig(PlanConfig):
                 raise ArgumentError(f"agent: expected {name} of at least 1, got {value}")
         if not isinstance(self.execute, Integral | None):
             raise ArgumentError(f"agent: expected execute as a whole number, got {self.execute!r}")
-        if self.execute is not None and self.horizon is not None and abs(self.execute) > self.horizon:
+        if self.execute is not None and self.horizon is not None and self.execute < -self.horizon:
             raise ArgumentError(
-                f"agent: expected execute from -horizon to horizon, got execute={self.execute}, horizon={self.horizon}"
+                f"agent: expected execute of at least -horizon, got execute={self.execute}, horizon={self.horizon}"
             )
         if self.pool is not None and self.pool < (self.candidates or 1):
             raise ArgumentError(

@@ -216,7 +216,8 @@ class DecisionPass:
         reviser, config = self._parts.reviser, self._parts.config
         actions, chosen = reviser.revise(self._revising[episode], plans, scores)
         source = f"{type(reviser.unwrapped).__name__}.revise"
-        return self._parts.space.check_plan(source, actions, config.longest), check_chosen(reviser, chosen, len(plans))
+        longest = max(config.longest, reviser.longest_decision or 0)
+        return self._parts.space.check_plan(source, actions, longest), check_chosen(reviser, chosen, len(plans))
 
     def _list_policies(self) -> list[Policy]:
         policy, reviser = self._parts.policy, self._parts.reviser

@@ -65,6 +65,9 @@ class Policy(ABC):
     frames: FrameSpec = FrameSpec()
     default_revision: str | None = None
     """Name of the default reviser, if this policy only proposes."""
+    longest_decision: int | None = None
+    """Maximum number of actions in a plan that `revise` returns, where that may be more than was proposed and
+    imagined. None: no more than a proposal has."""
     tokens: int = 0
     """Tokens read and written so far by the policy's language model; 0 without one."""
 

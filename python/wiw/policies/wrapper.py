@@ -22,6 +22,7 @@ class PolicyWrapper(Policy):
         self.needs: tuple[str, ...] = tuple(inner.needs)
         self.frames: FrameSpec = inner.frames
         self.default_revision = inner.default_revision
+        self.longest_decision = inner.longest_decision
 
     @property
     def unwrapped(self) -> Policy:

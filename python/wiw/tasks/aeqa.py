@@ -46,7 +46,8 @@ class AEQARules:
     horizon: int
     """L, actions per plan, where the turn that a plan begins with counts as one, whatever its angle."""
     execute: int
-    """Maximum number of primitives carried out before the next decision."""
+    """Maximum number of primitives carried out before the next decision. Plans have L - 1 + 8 at most; only routes that
+    policy `vlm` decides on may have more (`longest_route`)."""
     confirm: Literal["next_view", "same_view", "none"]
     """When a final answer ends the episode: given again after the next segment, given again at once on the same view
     (nothing is carried out in between), or the first time."""
@@ -125,8 +126,7 @@ class AEQA(NavigationTask):
     def defaults(self) -> dict[str, Any]:
         """Options for `wiw.Agent` that the task prescribes."""
         horizon = self.rules.horizon - 1 + HALF_TURN
-        execute = min(self.rules.execute, horizon)
-        return {"candidates": self.rules.candidates, "horizon": horizon, "execute": execute}
+        return {"candidates": self.rules.candidates, "horizon": horizon, "execute": self.rules.execute}
 
     @staticmethod
     def make_portable(options: Mapping[str, Any]) -> dict[str, Any]:

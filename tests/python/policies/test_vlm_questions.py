@@ -208,6 +208,16 @@ def test_the_turn_at_the_beginning_counts_as_one_action() -> None:
     assert len(steering.walk_in_view(3, np.full(16, FORWARD, np.int8), 2)) == 2
 
 
+def test_straight_ahead_is_a_turn_and_then_steps_alone() -> None:
+    assert steering.go_straight(steering.turn_to_view(3), HORIZON).tolist() == [LEFT] * 8 + [int(FORWARD)] * 13
+    assert steering.go_straight(steering.turn_to_view(0), HORIZON).tolist() == [int(FORWARD)] * 13
+    for degrees in (-170, -91, -12, 0, 11, 100, 179):
+        angle = np.radians(degrees)
+        pose, target = np.array([1.0, 2.0, 0.7]), thing(1 + 3 * np.cos(0.7 + angle), 2 + 3 * np.sin(0.7 + angle))
+        turned = end_of(steering.turn_to_landmark(pose, target))[2]
+        assert abs(turned - angle) <= TURN / 2 + 1e-9, degrees
+
+
 def test_a_step_that_is_refused_though_floor_is_seen_is_remembered(two_rooms: str) -> None:
     episode = make_episode(two_rooms)
     observation = AEQA(two_rooms).environment(depth=True).begin(episode)
@@ -338,6 +348,40 @@ def test_a_plan_that_only_turns_ends_with_real_views(two_rooms: str) -> None:
     text = words(revising)
     assert text.count("\nImagined views at its end:") == 1
     assert text.count("\nThe real views, turned, at its end:") == 2
+
+
+def test_a_route_is_walked_to_its_end_though_only_straight_steps_are_imagined(two_rooms: str) -> None:
+    def decide_officially(model: Any, **options: Any) -> Any:
+        script = Script(*THREE, revision=without_answer(THREE[0]))
+        return decide(two_rooms, make_policy(script, **options), model, horizon=10, execute=50)
+
+    whole = {"imagined": "straight", "longest_route": 50}
+    decision, plain = decide_officially("copy", **whole), decide_officially("copy")
+    straight = decision.proposals[0].actions
+    assert straight[-2:].tolist() == [int(FORWARD)] * 2 and len(set(straight[:-2].tolist())) <= 1
+    assert len(plain.actions) <= 10 and len(decision.actions) > len(plain.actions)
+    assert decision.actions[: len(plain.actions)].tolist() == plain.actions.tolist(), "the same route, further"
+    assert decision.execute == len(decision.actions) <= 50
+    assert len(decide_officially("copy", imagined="straight", longest_route=5).actions) == 5
+    alone = decide_officially(None, **whole)
+    assert alone.actions.tolist() == decision.actions.tolist() and alone.chosen == 0
+    assert alone.proposals[0].actions.tolist() == plain.actions.tolist(), "nothing is imagined"
+
+
+def test_what_stands_behind_straight_steps_is_said(two_rooms: str) -> None:
+    policy = make_policy(Script(*THREE, revision=without_answer(THREE[1])), imagined="straight", longest_route=50)
+    decision = decide(two_rooms, policy, "copy")
+    text = words(next(call for call in policy.client.calls if level(call) == "revise"))
+    assert text.count("Imagined views after the turn it begins with and some steps straight on:") == 3
+    assert "views at its end:" not in text
+    walked = [RIGHT] * 4 + [int(FORWARD)] * 3  # what the second question wrote, not what was imagined
+    assert decision.actions.tolist() == walked and decision.scores.argmax() == 1 and decision.chosen is None
+
+
+def test_an_answer_is_looked_at_again_where_straight_steps_are_imagined(two_rooms: str) -> None:
+    policy = make_policy(Script(command(landmark=1, answer="red")), imagined="straight", longest_route=50)
+    decision = decide(two_rooms, policy, "copy")
+    assert len(decision.actions) <= steering.LOOK and decision.answer.final and decision.chosen == 0
 
 
 def test_a_reviser_may_only_choose(two_rooms: str) -> None:
@@ -501,6 +545,9 @@ def test_options_out_of_range() -> None:
     for wrong in ({"history": -1}, {"order": "sideways"}):
         with pytest.raises(ArgumentError, match="history >= 0 and order"):
             make_policy(None, **wrong)
+    for wrong in ({"imagined": "nothing"}, {"longest_route": 0}):
+        with pytest.raises(ArgumentError, match="imagined plan or straight and longest_route of at least 1"):
+            make_policy(None, **wrong)
     for of_targets in ({"tracker": "flow"}, {"rounds": True}, {"answer_view": "target"}, {"tracker_options": {"a": 1}}):
         with pytest.raises(ArgumentError, match="only for tasks that point a target out"):
             make_policy(None, **of_targets)
@@ -524,6 +571,9 @@ def test_presets_give_the_policy_its_memory_and_order(two_rooms: str, tmp_path: 
         recipe = AgentRecipe("vlm", policy_options={"vlm": {**vlm["vlm"], **options}})
         policy = agent_for(AEQA(two_rooms, preset=preset), recipe).policy
         assert isinstance(policy, QuestionVLM) and (policy.history, policy.order) == expected
+        follows_code = preset == "official"
+        assert policy.imagined == ("straight" if follows_code else "plan")
+        assert policy.longest_decision == (50 if follows_code else None)
     own = tmp_path / "own.yaml"
     own.write_text("policies:\n  vlm: {history: 1}\n")
     task = AEQA(two_rooms, preset=own)

@@ -430,7 +430,7 @@ def test_one_and_two_workers_find_out_the_same(episode, tmp_path):
 def test_presets_differ_in_what_the_published_code_does():
     paper, official = AEQA(SCENE), AEQA(SCENE, preset="official")
     assert paper.defaults == {"candidates": 3, "horizon": 21, "execute": 15} and paper.limit == 250
-    assert official.defaults["execute"] == 21, "the whole plan"
+    assert official.defaults["execute"] == 50, "the whole plan, routes included"
     changed = {name for name, value in official.describe().items() if value != paper.describe()[name]}
     assert changed == {"execute", "confirm", "unanswered", "turns", "policies"}
-    assert wiw.Agent("heuristic", **official.defaults).config.execute == 21
+    assert wiw.Agent("heuristic", **official.defaults).config.count_executed(21) == 21

@@ -31,6 +31,8 @@ if TYPE_CHECKING:
 VIEWS_WORDS = f"{', '.join(VIEW_NAMES)} view, each {HFOV_DEG:g} degrees wide, side by side in one picture"
 """Value of the slot `obs_key`."""
 ORDERS = ("marked_first", "plain_first")
+IMAGINED = ("plan", "straight")
+STRAIGHT_END = "Imagined views after the turn it begins with and some steps straight on"
 WALK_SEED, ANSWER_SEED = 0x77616C6B, 0x73617973
 """Separate the seeds of a decision's questions."""
 NO_WALK = "the robot only turns to the view"
@@ -45,6 +47,8 @@ class QuestionMemory(Memory):
     """View of the present decision."""
     commands: dict[bytes, Command] = field(default_factory=dict)
     """Commands of the present decision by the plans that they became."""
+    ways: dict[bytes, NDArray[np.int8]] = field(default_factory=dict)
+    """What is carried out of each of these plans, where that is more or other than the plan."""
     answer: tuple[Key, str] | None = None
     """The planner's latest answer, empty if it gave none, and at which decision."""
     executed: int = 0
@@ -67,6 +71,10 @@ class QuestionVLM(VLM):
         perception: finds the landmarks: "learned", "detector" (a detector and a segmenter), or a `Labeller`.
         history: number of its latest commands that the planner is told; 0: it has no memory of them.
         order: which picture of the real views comes first, "marked_first" or "plain_first".
+        imagined: what the world model imagines of a command: "plan", or, as in the published code, "straight", the turn
+            to its landmark or view and then steps forward alone.
+        longest_route: primitives after which a route to a landmark is cut; it is carried out as far as the task lets a
+            decision go (`execute`), however little of it is imagined. None: a route is a plan like any other.
 
     Raises:
         ArgumentError: see `VLM`; perception that needs the simulator's instance ids.
@@ -84,12 +92,19 @@ class QuestionVLM(VLM):
         perception: Any = "learned",
         history: int = 5,
         order: Literal["marked_first", "plain_first"] = "marked_first",
+        imagined: Literal["plan", "straight"] = "plan",
+        longest_route: int | None = None,
         **options: Any,
     ) -> None:
         super().__init__(*args, **options)
         if history < 0 or order not in ORDERS:
             raise ArgumentError(
                 f"policy vlm: expected history >= 0 and order {' or '.join(ORDERS)}, got {history}, {order}"
+            )
+        if imagined not in IMAGINED or (longest_route is not None and longest_route < 1):
+            raise ArgumentError(
+                f"policy vlm: expected imagined {' or '.join(IMAGINED)} and longest_route of at least 1, got "
+                f"{imagined}, {longest_route}"
             )
         self.labeller: Labeller = LABELLERS.make(perception)
         if "ids" in self.labeller.needs:
@@ -98,6 +113,7 @@ class QuestionVLM(VLM):
                 "see; expected perception that uses only images, such as learned"
             )
         self.history, self.order = history, order
+        self.imagined, self.longest_decision = imagined, longest_route
         self.needs = ("depth",)
 
     @property
@@ -108,7 +124,9 @@ class QuestionVLM(VLM):
     def describe(self) -> dict[str, Any]:
         """Return a JSON-able identity, with the model, a digest of the prompts, and the perception."""
         own = {"perception": self.labeller.describe(), "history": self.history, "order": self.order}
-        return {**super().describe(), **own}
+        longer = {} if self.longest_decision is None else {"longest_route": self.longest_decision}
+        straight = {} if self.imagined == "plan" else {"imagined": self.imagined}
+        return {**super().describe(), **own, **longer, **straight}
 
     def begin(self, goal: Goal, key: Key) -> QuestionMemory:
         """Return an empty map."""
@@ -132,7 +150,7 @@ class QuestionVLM(VLM):
             waits = memory.answer is not None and memory.answer[1]  # the task may have asked again at once
             executed = np.array([] if waits else situation.executed[memory.executed :], np.int8)
             memory.sight = memory.home.add(situation.observation, views, own, situation.goal.text or "", executed)
-            memory.executed, memory.commands = len(situation.executed), {}
+            memory.executed, memory.commands, memory.ways = len(situation.executed), {}, {}
 
     # -- plans ---------------------------------------------------------------------------------------------------------
 
@@ -187,18 +205,27 @@ class QuestionVLM(VLM):
         ]
 
     def _plan_command(self, situation: Situation, command: Command, walks: Iterator[Reply]) -> Proposal:
+        """Return the plan of a command as it is imagined, and remember what is to be carried out of it."""
         memory: QuestionMemory = situation.memory
+        pose, horizon = situation.observation.odometry, memory.horizon
         if command.landmark is not None:
-            grid, pose = memory.home.grid, situation.observation.odometry
-            actions = steering.follow_route(grid, pose, command.landmark, memory.horizon)
+            route = steering.find_route(memory.home.grid, pose, command.landmark)
+            turn, way = steering.turn_to_landmark(pose, command.landmark), steering.cut_plan(route, horizon)
+            way = route[: self.longest_decision] if self.longest_decision is not None and len(route) else way
         else:
             reply = next(walks)
             self._record_exchange(situation.key, "walk", reply, NO_WALK)
             walk = np.zeros(0, np.int8) if reply.problem else commands.parse_walk(reply.value)
-            actions = steering.walk_in_view(command.view, walk, memory.horizon)
-        actions = actions[: steering.LOOK] if command.answer else actions
-        memory.commands.setdefault(actions.tobytes(), command)
-        return Proposal(actions, note=command.plan)
+            turn, way = steering.turn_to_view(command.view), steering.walk_in_view(command.view, walk, horizon)
+        if command.answer:
+            way = plan = way[: steering.LOOK]
+        elif situation.imagines and self.imagined == "straight":
+            plan = steering.go_straight(turn, horizon)
+        else:
+            plan = steering.cut_plan(way, horizon)
+        memory.commands.setdefault(plan.tobytes(), command)
+        memory.ways.setdefault(plan.tobytes(), way)
+        return Proposal(plan, note=command.plan)
 
     def _build_walk_request(self, situation: Situation, command: Command) -> Request:
         words = self._render_prompt(situation, "low_level_planner", commands.WALK_ACTIONS, command=command)
@@ -241,7 +268,9 @@ class QuestionVLM(VLM):
         parts = self._build_plan_prompt(situation, memory.horizon)
         parts.append(self._render_prompt(situation, "chooser" if selects else "planner_imagined", memory.horizon))
         for number, (plan, rollout) in enumerate(zip(proposals, rollouts, strict=True), 1):
-            words = f"Plan {number}: {_describe_plan(memory, plan)}\n{prompt_images.describe_end(rollout)}:"
+            is_straight = self.imagined == "straight" and plan.actions.tobytes() in memory.commands
+            end = STRAIGHT_END if is_straight else prompt_images.describe_end(rollout)
+            words = f"Plan {number}: {_describe_plan(memory, plan)}\n{end}:"
             parts += [words, prompt_images.render_end(rollout)]
         options: dict[str, Any] = {"seed": derive_seed(situation.key, REVISION_SEED), "tries": self.tries}
         if selects:
@@ -274,7 +303,9 @@ class QuestionVLM(VLM):
         command = memory.commands.get(actions.tobytes())
         if command is not None and not command.answer:
             memory.history.append(f"after {len(situation.executed)} actions: {command.plan}")
-        return actions, chosen
+        way = memory.ways.get(actions.tobytes(), actions)
+        follows = np.array_equal(way[: len(actions)], actions)  # else another plan is carried out than was imagined
+        return way, chosen if follows else None
 
     # -- answers -------------------------------------------------------------------------------------------------------
 

@@ -20,13 +20,21 @@ LOOK_AROUND = 4
 """Left turns where a command leads nowhere: a quarter turn."""
 
 
-def follow_route(grid: OccupancyGrid, pose: NDArray[np.float64], landmark: Landmark, horizon: int) -> NDArray[np.int8]:
-    """Return the first primitives of the route to a landmark, or the turn towards it where the agent is there."""
+def find_route(grid: OccupancyGrid, pose: NDArray[np.float64], landmark: Landmark) -> NDArray[np.int8]:
+    """Return the route to a landmark, or the way towards it where the agent is there."""
     found = route(grid, pose, landmark.destination, landmark.radius).actions
-    if not len(found):
-        away = landmark.position[:2] - pose[:2]
-        found = route(grid, pose, float(np.arctan2(away[1], away[0]))).actions
-    return cut_plan(found, horizon)
+    return found if len(found) else route(grid, pose, measure_bearing(pose, landmark)).actions
+
+
+def follow_route(grid: OccupancyGrid, pose: NDArray[np.float64], landmark: Landmark, horizon: int) -> NDArray[np.int8]:
+    """Return the first primitives of the route to a landmark, or of the way towards it where the agent is there."""
+    return cut_plan(find_route(grid, pose, landmark), horizon)
+
+
+def measure_bearing(pose: NDArray[np.float64], landmark: Landmark) -> float:
+    """Return the azimuth at which a landmark lies."""
+    away = landmark.position[:2] - pose[:2]
+    return float(np.arctan2(away[1], away[0]))
 
 
 def walk_in_view(view: int, walk: NDArray[np.int8], horizon: int) -> NDArray[np.int8]:
@@ -36,7 +44,23 @@ def walk_in_view(view: int, walk: NDArray[np.int8], horizon: int) -> NDArray[np.
 
 def turn_to_view(view: int) -> NDArray[np.int8]:
     """Return the turn to a view, the left one where both are as long."""
-    turns = round(np.radians(VIEW_YAWS_DEG[view]) / TURN)
+    return _turn_by(float(np.radians(VIEW_YAWS_DEG[view])))
+
+
+def turn_to_landmark(pose: NDArray[np.float64], landmark: Landmark) -> NDArray[np.int8]:
+    """Return the shorter turn towards a landmark, to the nearest heading that turns lead to."""
+    angle = measure_bearing(pose, landmark) - pose[2]
+    return _turn_by(float(np.arctan2(np.sin(angle), np.cos(angle))))
+
+
+def go_straight(turn: NDArray[np.int8], horizon: int) -> NDArray[np.int8]:
+    """Return a turn, and then as many steps forward as a plan of L actions has after its turn."""
+    steps = np.full(max(1, horizon - HALF_TURN), FORWARD, np.int8)
+    return np.concatenate([turn, steps])[:horizon]
+
+
+def _turn_by(angle: float) -> NDArray[np.int8]:
+    turns = round(angle / TURN)
     return np.full(abs(turns), TURN_LEFT if turns > 0 else TURN_RIGHT, np.int8)
 
 
