@@ -7,7 +7,6 @@ Neither is downloaded by this package: the head is where the user put it, and CL
 
 from __future__ import annotations
 
-import hashlib
 from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import Any
@@ -55,6 +54,8 @@ class LaionScorer:
         pretrained.import_transformers()
         import torch
 
+        from wiw.weight_file import digest
+
         self._device = ("cuda" if torch.cuda.is_available() else "cpu") if device == "auto" else device
         self._head = {name: value.to(self._device) for name, value in _read_head(head).items()}
         clip = str(where / CLIP) if (where / CLIP).is_dir() else f"openai/{CLIP}"
@@ -67,11 +68,13 @@ class LaionScorer:
                 f"{clip}: expected embeddings of 768 numbers, as CLIP ViT-L/14 gives, got {wide}; put {CLIP} there",
                 "unfit",
             )
-        self._digest = hashlib.sha256(head.read_bytes()).hexdigest()[:12]
+        networks = {"head": self._head, "clip": self._clip.state_dict()}
+        values = {f"{part}/{name}": value for part, own in networks.items() for name, value in own.items()}
+        self._digest = digest(values)[:12]
 
     @property
     def card(self) -> ScorerCard:
-        """Its identity; the version is the digest of the head's file."""
+        """Its identity; the version is a digest of the weights of head and CLIP."""
         licence = "Apache-2.0 (head), MIT (CLIP)"
         return ScorerCard("laion-improved-aesthetic", self._digest, licence, {"laion_aesthetic": None})
 

@@ -308,6 +308,11 @@ def test_laions_predictor_on_the_real_classes(tmp_path: Path, paths: list[Path])
     np.testing.assert_allclose(found, expected.numpy(), rtol=1e-4, atol=1e-5)
     assert len(set(found)) == len(paths)
 
+    version = scorer.card.version
+    assert LaionScorer(tmp_path).card.version == version
+    network.visual_projection.weight.data[0, 0] += 1
+    network.save_pretrained(tmp_path / laion.CLIP)
+    assert LaionScorer(tmp_path).card.version != version, "another CLIP gives other scores"
     torch.save({**state, "layers.7.weight": torch.zeros(1, 8)}, tmp_path / laion.HEAD)
     with pytest.raises(WeightsError, match=r"layers\.7\.weight differs") as caught:
         LaionScorer(tmp_path)
