@@ -181,7 +181,7 @@ def _add_cuts(outcome: Mapping[str, Any], cuts: Cuts) -> Mapping[str, Any]:
     found = {
         cuts.name_metric(cut): float(right[min(cut, len(right)) - 1])
         if right
-        else float(metrics["success"] and metrics["decisions"] <= cut)
+        else float(metrics["success"]) * (metrics["decisions"] <= cut)
         for cut in cuts.at
     }
     return {**outcome, "metrics": {**metrics, **found}}

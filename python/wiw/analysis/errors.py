@@ -138,7 +138,7 @@ def summarise_errors(
     scored = set.intersection(*(set(done[arm]) for arm in (FLOOR, CEILING, *pooled_arms)))
     metric = next(
         metric
-        for metric in (SUCCESS, ANSWER_SCORE)
+        for metric in (ANSWER_SCORE, SUCCESS)
         if all(metric.name in row["metrics"] for own in done.values() for row in own.values())
     )
     lines = _adjust([_summarise_arm(arm, *arms[arm], done, measured, metric, seed) for arm in shown])

@@ -6,7 +6,7 @@ from __future__ import annotations
 import math
 import sys
 import warnings
-from collections.abc import Collection, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cache, reduce
 from typing import Any
@@ -233,7 +233,7 @@ def summarise(
     outcomes: Sequence[Mapping[str, Any]],
     episodes: int,
     seed: int = 0,
-    policies: Collection[str] = (),
+    agents: Mapping[str, Mapping[str, Any]] | None = None,
     *,
     tables: TableSpec = TableSpec(),  # noqa: B008 - frozen
     twins: Sequence[tuple[int, int]] = (),
@@ -248,7 +248,7 @@ def summarise(
         outcomes: ended episodes with "arm", "episode", "scene", "status", "metrics", and "task" where there are kinds.
         episodes: how many the run has.
         seed: of the bootstrap.
-        policies: arms that have no world model and differ from "none" by their policy.
+        agents: descriptions of the arms' agents, from which follow their roles; without them, roles are by names.
         tables: what the task has tables show.
         twins: pairs of episodes that are twins.
         judge: whose marks the outcomes have, where answers are judged.
@@ -256,7 +256,8 @@ def summarise(
         anytime: whether the run was looked at before it was stopped, so that p must allow for that.
     """
     done, errors = split_outcomes(arms, outcomes)
-    lines = tuple(_summarise_arm(arm, role_of(arm, policies), done[arm], errors[arm], episodes, seed) for arm in arms)
+    roles = {arm: role_of(arm, None if agents is None else agents[arm]) for arm in arms}
+    lines = tuple(_summarise_arm(arm, roles[arm], done[arm], errors[arm], episodes, seed) for arm in arms)
     differences = tuple(
         difference
         for base in ("none", FLOOR)
@@ -277,20 +278,20 @@ def summarise(
 def summarise_run(run: Run) -> Summary:
     """Return means, intervals and paired differences of a run."""
     config = run.store.config
-    policies = [arm["name"] for arm in config["arms"] if arm["agent"].get("model") is None]
+    agents = {arm["name"]: arm["agent"] for arm in config["arms"]}
     episodes, outcomes = run.store.episodes(), run.store.outcomes()
     found = summarise(
         run.arms,
         outcomes,
         len(run.store.own_episodes()) if "stopped" in run.store.info else len(episodes),
         config["seed"],
-        policies,
+        agents,
         tables=run.tables,
         twins=find_twins(episodes),
         judge=run.store.judge,
         anytime="until" in run.store.info,
     )
-    tiers = _summarise_tiers(run, outcomes, policies)
+    tiers = _summarise_tiers(run, outcomes, agents)
     answers = run.store.count_answers()
     return replace(
         found,
@@ -346,7 +347,9 @@ def _describe_looks(info: Mapping[str, Any]) -> str:
     )
 
 
-def _summarise_tiers(run: Run, outcomes: Sequence[Mapping[str, Any]], policies: Collection[str]) -> dict[str, Summary]:
+def _summarise_tiers(
+    run: Run, outcomes: Sequence[Mapping[str, Any]], agents: Mapping[str, Mapping[str, Any]]
+) -> dict[str, Summary]:
     """Return the numbers of each tier of episodes; nothing if there is one tier, or none."""
     episodes = run.store.episodes()
     own = run.store.own_episodes() if "stopped" in run.store.info else range(len(episodes))
@@ -358,7 +361,7 @@ def _summarise_tiers(run: Run, outcomes: Sequence[Mapping[str, Any]], policies: 
             [outcome for outcome in outcomes if outcome["episode"] in indices[tier]],
             len(indices[tier]),
             run.store.config["seed"],
-            policies,
+            agents,
             tables=run.tables,
             anytime="until" in run.store.info,
         )
@@ -433,15 +436,29 @@ def split_outcomes(
     return done, errors
 
 
-def role_of(arm: str, policies: Collection[str] = ()) -> str:
-    """Return the role of an arm, from its name; `policies` are the arms without a world model."""
+def role_of(arm: str, agent: Mapping[str, Any] | None = None) -> str:
+    """Return the role of an arm: by the description of its agent, or by its name where that is not known."""
     if arm in ROLES:
         return ROLES[arm]
+    return _read_role(arm) if agent is None else _describe_role(agent)
+
+
+def _describe_role(agent: Mapping[str, Any]) -> str:
+    if "error" in agent:
+        return ERRONEOUS
+    if "placebo" in agent:
+        return PLACEBOS[f"placebo-{agent['placebo']}"]
+    if "reseed" in agent:
+        return REPEATS[RESEEDED]
+    return ANOTHER_POLICY if agent.get("model") is None else WORLD_MODEL
+
+
+def _read_role(arm: str) -> str:
     kind = arm.rpartition("+")[2].partition(":")[0]
     if kind.startswith(ERROR):
         return ERRONEOUS
     special = {**PLACEBOS, **REPEATS}.get(RESEEDED if kind.startswith(f"{RESEEDED}-") else kind)
-    return special or (ANOTHER_POLICY if arm in policies else WORLD_MODEL)
+    return special or WORLD_MODEL
 
 
 def _compare_with(
@@ -639,9 +656,16 @@ def _explain_utility(summary: Summary) -> list[str]:
     found = ["U = (SR - copy) / (oracle - copy), on the episodes scored in all three; Fieller's interval."]
     if any(not one.is_defined for one in summary.utilities):
         span = [each for each in summary.differences if (each.arm, each.base, each.metric) == SPAN]
-        below = any(each.estimate.high < 0 for each in span)
-        found.append(f"Utility undefined: the interval for oracle - copy {'lies below' if below else 'includes'} 0.")
+        found.append(f"Utility undefined: {_explain_span(span)}.")
     return found
+
+
+def _explain_span(span: Sequence[Difference]) -> str:
+    if any(each.estimate.high < 0 for each in span):
+        return "the interval for oracle - copy lies below 0"
+    if any(each.estimate.low > 0 for each in span):
+        return "too little data for an interval of this ratio"
+    return "the interval for oracle - copy includes 0"
 
 
 def _explain_partial(summary: Summary) -> list[str]:

@@ -13,7 +13,7 @@ from tyro.conf import arg
 def study_data_scaling(
     *,
     data: Annotated[Path | None, arg(metavar="DIR")] = None,
-    out: Annotated[Path, arg(metavar="DIR")] = Path("runs/data-scaling"),
+    out: Annotated[Path | None, arg(metavar="DIR")] = None,
     small: bool = False,
     models: Annotated[str | None, arg(metavar="A,B")] = None,
     clips: Annotated[int | None, arg(metavar="N")] = None,
@@ -47,7 +47,8 @@ def study_data_scaling(
     Args:
         data: Folder of `wiw collect navigation`, with panoramas and depth. Default: collect 16 apartments at 128x256
             into --out, which is enough for --small.
-        out: New folder, or one that the same command started.
+        out: New folder, or one that the same command started. Default: runs/data-scaling, with --small
+            runs/data-scaling-small.
         small: Use the small version's numbers where none are given: 32x64 pixels, 3,200 clips.
         models: Models to train, of warpnet and pocket. Default: both.
         clips: The largest number of clips; the smallest is a hundredth of it. Default: 12,800.
@@ -85,8 +86,9 @@ def study_data_scaling(
     changes = {name: value for name, value in given.items() if value is not None}
     lists = {name: tuple(value) for name, value in changes.items() if isinstance(value, list)}
     settings = replace(SMALL if small else FULL, **changes | lists)
+    folder = _choose_folder(out, "data-scaling", small)
     with announce_resume(), Bars() as bars:
-        found = data_scaling(data, out, settings, workers=workers, episodes=imagenav, device=device, watch=bars.show)
+        found = data_scaling(data, folder, settings, workers=workers, episodes=imagenav, device=device, watch=bars.show)
     found.summary()
     for path in found.save():
         print(path)
@@ -95,7 +97,7 @@ def study_data_scaling(
 
 def study_errors(
     *,
-    out: Annotated[Path, arg(metavar="DIR")] = Path("runs/errors"),
+    out: Annotated[Path | None, arg(metavar="DIR")] = None,
     small: bool = False,
     tasks: Annotated[str | None, arg(metavar="A,B,...")] = None,
     kinds: Annotated[str | None, arg(metavar="A,B,...")] = None,
@@ -132,7 +134,7 @@ def study_errors(
     errors as arms: `wiw run imagenav --arms none,error-blur@16,oracle`. docs/errors.md has our results.
 
     Args:
-        out: New folder, or one that the same command started.
+        out: New folder, or one that the same command started. Default: runs/errors, with --small runs/errors-small.
         small: Use the small version's numbers where none are given.
         tasks: Tasks, of imagenav, ar, aeqa and manipulation. Default: all.
         kinds: Kinds of error. Default: all.
@@ -176,15 +178,21 @@ def study_errors(
     }
     changes = {name: value for name, value in given.items() if value is not None}
     settings = replace(SMALL if small else FULL, **changes)
+    folder = _choose_folder(out, "errors", small)
     if read_only:
-        found = read_errors(out, settings)
+        found = read_errors(folder, settings)
     else:
         with announce_resume(), Bars() as bars:
-            found = study(out, settings, workers=workers, lpips=lpips, watch=bars.show)
+            found = study(folder, settings, workers=workers, lpips=lpips, watch=bars.show)
     found.summary()
     for path in found.save():
         print(path)
     return 0
+
+
+def _choose_folder(given: Path | None, name: str, small: bool) -> Path:
+    """Return the folder of a study; the small version has one of its own, since the full one asks for other runs."""
+    return Path("runs") / f"{name}{'-small' if small else ''}" if given is None else given
 
 
 STUDIES: tuple[tuple[Callable[..., int], str, str], ...] = (

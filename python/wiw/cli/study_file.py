@@ -32,7 +32,7 @@ def run_study(
 
     Args:
         study: Name of a study, or path of a YAML file.
-        out: Folder to write. Default: runs/study-NAME.
+        out: Folder to write. Default: runs/study-NAME, with --small runs/study-NAME-small.
         set: Value of one of the study's variables, as YAML; may be repeated.
         small: Use the study's small values, for a quick look.
         workers: Number of processes; results do not depend on it.

@@ -95,7 +95,8 @@ def merge(stores: Sequence[str | Path], out: str | Path, scratch: str | Path | N
         takes, repeated, unlike = _choose_sources(parts)
         local = stack.enter_context(make_local_folder(scratch))
         created = min(part.created for part in parts)
-        target = RunStore.create(out, parts[0].config, _merge_info(parts), parts[0].episodes(), local, created)
+        first, version = parts[0], parts[0].wiw_version
+        target = RunStore.create(out, first.config, _merge_info(parts), first.episodes(), local, created, version)
         try:
             for part, episodes in zip(parts, takes, strict=True):
                 target.take_episodes(part, episodes)
@@ -222,6 +223,7 @@ def _merge_info(parts: Sequence[RunStore]) -> dict[str, Any]:
     named = ("shard", "platform", "command", "preparation_seconds", "session")
     info = {name: value for name, value in infos[0].items() if name not in ("shard", "session")}
     info["built"] = {arm: agent for own in reversed(infos) for arm, agent in own.get("built", {}).items()}
+    info["benchmark"] = parts[0].benchmark
     info["preparation_seconds"] = sum(own.get("preparation_seconds", 0.0) for own in infos)
     info["merged"] = [
         {"store": str(part.path.parent), "created": part.created, **{name: own.get(name) for name in named}}

@@ -7,7 +7,7 @@ them during the run, and those that are not chosen lose them when every arm has 
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from typing import Any
 
 from wiw.runs.store import RunStore
@@ -15,8 +15,10 @@ from wiw.types import Episode
 
 POOL = 12
 """Episodes that keep pictures during a run; more if more are to keep them after it."""
-FLOORS, CEILING, CONTROL = ("copy", "none"), "oracle", "placebo"
+FLOORS, CEILING = ("copy", "none"), "oracle"
 """Names of arms that are not models under test; of the floors the first that the run has counts."""
+CHANGES = {"placebo", "error", "reseed"}
+"""What makes an agent a control, in its description."""
 
 
 def spread_evenly(episodes: Sequence[Episode], count: int) -> list[int]:
@@ -37,15 +39,21 @@ def pool_episodes(episodes: Sequence[Episode], count: int) -> list[int]:
 
 
 def choose_episodes(
-    episodes: Sequence[Episode], pool: Sequence[int], outcomes: Sequence[Mapping[str, Any]], count: int
+    episodes: Sequence[Episode],
+    pool: Sequence[int],
+    outcomes: Sequence[Mapping[str, Any]],
+    count: int,
+    controls: Collection[str] = (),
 ) -> list[int]:
     """Return the episodes that keep their pictures, the first of them being the one to show first.
 
-    They are spread evenly over the run; an episode of the pool in which a model succeeds and the floor fails takes the
-    place of the nearest of its group, unless there is such an episode among them.
+    They are spread evenly over the run as far as the pool reaches; an episode of the pool in which a model succeeds and
+    the floor fails takes the place of the nearest of its group, unless there is such an episode among them. Arms that
+    are `controls` count for nothing.
     """
-    chosen = spread_evenly(episodes, count)
-    gains = {index: _rate_gain(index, outcomes) for index in {*pool, *chosen}}
+    chosen = spread_evenly(episodes[: max(pool, default=-1) + 1], count)
+    rated = [row for row in outcomes if row["arm"] not in controls]
+    gains = {index: _rate_gain(index, rated) for index in {*pool, *chosen}}
     best = max(sorted(gains), key=lambda index: (gains[index], index in chosen), default=None)
     if best is None or gains[best] == (0, 0):
         return chosen
@@ -60,7 +68,10 @@ def choose_pictured_episodes(store: RunStore) -> list[int]:
     info = store.info
     if "keep_images" not in info:
         return [int(index) for index in info["pictures"]]
-    return choose_episodes(store.episodes(), info["pictures"], store.outcomes(), info["keep_images"])
+    last = info["stopped"]["episodes"] if "stopped" in info else None
+    pool = [index for index in info["pictures"] if last is None or index < last]
+    controls = {arm["name"] for arm in store.config["arms"] if CHANGES & arm["agent"].keys()}
+    return choose_episodes(store.episodes()[:last], pool, store.outcomes(), info["keep_images"], controls)
 
 
 def drop_spare_pictures(store: RunStore) -> None:
@@ -80,7 +91,5 @@ def _rate_gain(index: int, outcomes: Sequence[Mapping[str, Any]]) -> tuple[int, 
     floor = next((success[arm] for arm in FLOORS if arm in success), True)
     if floor:
         return 0, 0
-    models = [
-        arm for arm in success if arm not in (*FLOORS, CEILING) and not arm.rpartition("+")[2].startswith(CONTROL)
-    ]
+    models = [arm for arm in success if arm not in (*FLOORS, CEILING)]
     return sum(success[arm] for arm in models), int(success.get(CEILING, False))

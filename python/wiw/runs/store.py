@@ -89,6 +89,7 @@ class RunStore:
         episodes: Iterable[Episode],
         scratch: str | Path | None = None,
         created: str | None = None,
+        version: str | None = None,
     ) -> RunStore:
         """Create a store for writing.
 
@@ -100,6 +101,7 @@ class RunStore:
             scratch: folder on a local disk; given, the store is written there, and copied to `run` when a session
                 begins, then at most once a minute, and when it is closed.
             created: when the run began; now if not given.
+            version: of wiw that ran it; this one if not given.
 
         Raises:
             StoreError: a run is already there, or the folder cannot be written or is on a network file system.
@@ -117,10 +119,12 @@ class RunStore:
             copy.discard()
         store = cls(path, connect(path, lock), lock, copy)
         with store._close_on_error():
-            store._fill(created or _format_now(), config, info, episodes)
+            store._fill(created or _format_now(), version or wiw.__version__, config, info, episodes)
         return store
 
-    def _fill(self, created: str, config: dict[str, Any], info: dict[str, Any], episodes: Iterable[Episode]) -> None:
+    def _fill(
+        self, created: str, version: str, config: dict[str, Any], info: dict[str, Any], episodes: Iterable[Episode]
+    ) -> None:
         with self._writing() as connection:
             for statement in SCHEMA.read_text().split(";\n"):
                 connection.execute(statement)
@@ -130,7 +134,7 @@ class RunStore:
             if "command" in recorded:
                 recorded["command"] = [_hide_secret(argument) for argument in recorded["command"]]
             connection.execute(
-                "INSERT INTO run VALUES (1, ?, ?, ?, ?)", (created, wiw.__version__, to_json(config), to_json(recorded))
+                "INSERT INTO run VALUES (1, ?, ?, ?, ?)", (created, version, to_json(config), to_json(recorded))
             )
             connection.executemany(
                 "INSERT INTO episode VALUES (?, ?, ?, ?, ?, ?, ?, ?, ?, ?, ?, ?, ?)",

@@ -206,17 +206,21 @@ def _open_store(base: RunStore, agents: Mapping[str, AgentRecipe]) -> RunStore:
         "attributes": base.created,
     }
     folder = base.path.parent / FOLDER
+    built, recipes = _describe_expected_agents(base), {name: recipe.to_json() for name, recipe in agents.items()}
     if RunStore.exists(folder):
-        return RunStore.resume(folder, config)
+        store = RunStore.resume(folder, config, more_arms=True)  # the run may have been given arms since
+        if len(store.config["arms"]) < len(agents):
+            store.add_arms(config, {"agents": recipes, "built": {**built, **store.info["built"]}})
+        return store
     own = ("keep_images", "resumed_with", "session")  # the run chooses pictures for both
     info = {name: value for name, value in base.info.items() if name not in own}
     info |= {
         "platform": describe_platform(),
-        "agents": {name: recipe.to_json() for name, recipe in agents.items()},
+        "agents": recipes,
         "limits": {name: value for name, value in info["limits"].items() if name not in ("fidelity", "lpips")},
         "command": sys.argv,
         "preparation_seconds": 0.0,
-        "built": _describe_expected_agents(base),
+        "built": built,
     }
     return RunStore.create(folder, config, info, base.episodes())
 

@@ -153,8 +153,8 @@ def _open(run: str | Path | RunLog, judge: str | None) -> RunLog:
 
 def _summarise_arms(log: RunLog, both: Summary, labels: Mapping[str, str]) -> list[ArmSummary]:
     """Return the lines of one run's arms, with their roles in it and what it still has to run; `labels` by arm."""
-    policies = [one["name"] for one in log.store.config["arms"] if one["agent"].get("model") is None]
-    lines = [replace(both[label], role=role_of(arm, policies)) for arm, label in labels.items()]
+    agents = {one["name"]: one["agent"] for one in log.store.config["arms"]}
+    lines = [replace(both[label], role=role_of(arm, agents[arm])) for arm, label in labels.items()]
     if "stopped" not in log.store.info:
         return lines
     episodes = len(log.store.own_episodes())

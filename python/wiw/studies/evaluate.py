@@ -34,6 +34,7 @@ from wiw.runs.servers import require_servable
 from wiw.runs.shards import Shard
 from wiw.runs.store import RunStore, leave_resumable
 from wiw.studies.run_log import RunLog
+from wiw.types import Episode
 
 
 def evaluate(
@@ -193,17 +194,16 @@ def _run(task: Any, agents: Mapping[str, Any], settings: RunConfig, more_arms: b
             _add_arms(store, config, _describe_agents(task, agents, built, count))
     else:
         started, salt = time.perf_counter(), _choose_salt(settings)
-        episodes = built.episodes(count)
+        episodes, pictured = built.episodes(count), settings.count_pictured(count)
         used = built.require(episodes)
         folder = settings.out or Path("runs") / f"{built.name}-{datetime.now():%Y%m%d-%H%M%S}"
         info = {
             "platform": describe_platform(),
             "task": task.to_json(),
             **_describe_agents(task, agents, built, count),
-            "pictures": pool_episodes(
-                episodes if looks is None else episodes[: looks.every], settings.count_pictured(count)
-            ),
-            "keep_images": settings.count_pictured(count),
+            "pictures": _pool_pictures(episodes, looks, pictured),
+            "keep_images": pictured,
+            "pictured": pictured,
             "scenes": used,
             "stage": built.stage,
             "wording": asdict(built.wording),
@@ -222,6 +222,12 @@ def _run(task: Any, agents: Mapping[str, Any], settings: RunConfig, more_arms: b
         with leave_resumable(store):
             return _finish(store, task, agents, settings.workers, settings.progress, settings.place)
     return _finish(store, task, agents, settings.workers, settings.progress, settings.place)
+
+
+def _pool_pictures(episodes: Sequence[Episode], looks: StopRule | None, count: int) -> list[int]:
+    """Return the episodes that keep pictures while the run goes on; with looks, of those before the first if any."""
+    certain = episodes if looks is None or count >= len(episodes) else episodes[: looks.every]
+    return pool_episodes(certain, count)
 
 
 def _choose_salt(settings: RunConfig) -> str:
@@ -266,14 +272,17 @@ def _apply_settings(store: RunStore, settings: RunConfig) -> None:
     """Let a resumed run continue with these settings; close the store if that would change what is measured.
 
     Raises:
-        StoreError: fidelity was measured differently so far, or the shard or salt differs.
+        StoreError: fidelity was measured differently so far, other episodes keep pictures, or shard or salt differ.
     """
     begun_with, now = Limits(**store.info["limits"]).to_json(), settings.to_json()
     begun_with["shard"], now["shard"] = store.info.get("shard"), settings.shard
     begun_with["until"], now["until"] = store.info.get("until"), settings.looks
+    begun_with["keep_images"] = now["keep_images"] = store.info.get("pictured")
+    if settings.keep_images != RunConfig.keep_images and begun_with["keep_images"] is not None:
+        now["keep_images"] = settings.count_pictured(store.config["episodes"])  # pictures cannot be added later
     try:
         begun_with["salt"], now["salt"] = store.salt, store.salt if settings.salt is None else settings.salt
-        names = ("fidelity", "fidelity_share", "lpips", "shard", "until", "salt")
+        names = ("fidelity", "fidelity_share", "lpips", "shard", "until", "salt", "keep_images")
         store.require_same(*({name: each[name] for name in names} for each in (begun_with, now)))
     except StoreError:
         store.close()

@@ -448,7 +448,7 @@ def _summarise(
 def _read_outcomes(arms: Sequence[_Arm]) -> tuple[Metric, dict[str, dict[int, float]]]:
     """Return what counts as success, and its value by arm and episode."""
     done = {arm.label: split_outcomes([arm.name], _list_outcomes(arm))[0][arm.name] for arm in arms}
-    for metric in (SUCCESS, ANSWER_SCORE):
+    for metric in (ANSWER_SCORE, SUCCESS):
         values = {
             label: {index: row["metrics"][metric.name] for index, row in rows.items() if metric.name in row["metrics"]}
             for label, rows in done.items()

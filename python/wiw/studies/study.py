@@ -46,7 +46,10 @@ class StudyPart:
         """Return the numbers as plain values."""
         return {
             "run": self.run.name,
-            "arms": [{**line, "rollouts": self.rollouts[line["arm"]]} for line in self.log.table()],
+            "arms": [  # a line may be no arm's: the best guess from a question's text
+                {**line, **({"rollouts": self.rollouts[arm]} if (arm := line["arm"]) in self.rollouts else {})}
+                for line in self.log.table()
+            ],
             "differences": [asdict(each) for each in self.differences],
             **({} if self.quality is None else {"quality": self.quality.as_dict()}),
         }
@@ -107,7 +110,7 @@ def study(
 
     Args:
         name: name of a built-in study (`wiw list studies`), or the path of a YAML file.
-        out: folder to write; by default runs/study-NAME.
+        out: folder to write; by default runs/study-NAME, or runs/study-NAME-small with the small values.
         variables: values that override the file's.
         small: whether to use the file's small values.
         workers: number of processes; results do not depend on it.
@@ -118,7 +121,8 @@ def study(
         StoreError: the folder holds runs with other settings, or with arms that have changed or are now left out.
     """
     plan = load_study(name, variables, small)
-    folder = Path(out) if out is not None else Path("runs") / f"study-{Path(name).stem}"
+    own = f"study-{Path(name).stem}{'-small' if small else ''}"
+    folder = Path(out) if out is not None else Path("runs") / own
     for run in plan.runs:
         _require(run)
     if not (folder / FILE).exists():

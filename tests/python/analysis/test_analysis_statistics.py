@@ -266,11 +266,15 @@ def test_empty_run_has_no_numbers():
         summary["warp"]
 
 
+POLICIES: dict[str, dict[str, str]] = {"none": {}, "heuristic": {}, "geometric": {}}
+"""Descriptions of agents without a world model."""
+
+
 @pytest.mark.parametrize("width", [80, 120])
 def test_a_terminal_table_keeps_every_number(width):
     arms = ["none", "copy", "heuristic", "geometric"]
     outcomes = [outcome(arm, i, float((i + len(arm)) % 3 == 0)) for arm in arms for i in range(120)]
-    summary = SummaryTable.of(summarise(arms, outcomes, 120, policies=["none", "heuristic", "geometric"]))
+    summary = SummaryTable.of(summarise(arms, outcomes, 120, agents=POLICIES | {"copy": {"model": "copy"}}))
     with Console(width=width, file=io.StringIO(), record=True) as console:
         console.print(summary)
     shown = console.export_text()
@@ -281,7 +285,7 @@ def test_a_terminal_table_keeps_every_number(width):
 
 
 def test_arms_say_what_they_are():
-    summary = summarise(["none", "geometric", "warp"], [], episodes=3, policies=["none", "geometric"])
+    summary = summarise(["none", "geometric", "warp"], [], 3, agents={**POLICIES, "warp": {"model": "warp"}})
     roles = [line.role for line in summary.arms]
     assert roles == ["policy without a world model", "another policy without a world model", "world model"]
 

@@ -62,6 +62,13 @@ def test_the_report_shows_utilities_on_one_scale():
     assert len(zero) == 5 and len(set(zero)) == 1
 
 
+def test_why_utility_is_undefined_agrees_with_the_table():
+    rows = run({"copy": 0.0, "mine": 0.5, "oracle": 1.0}, per_scene=5)
+    found = summarise(["copy", "mine", "oracle"], [row for row in rows if row["scene"] == "s0"], 5)
+    assert not found.utility("mine").is_defined and found.difference("oracle", "copy").estimate.low > 0
+    assert any("too little data for an interval of this ratio" in line for line in notes(found))
+
+
 def test_only_the_world_model_under_test_is_no_reference():
     assert {one.arm for one in summary().utilities if not one.reference} == {"mine"}
     for arm in ("placebo-shuffled:mine", "placebo-swapped", "heuristic+placebo-swapped:mine"):

@@ -5,6 +5,8 @@ from __future__ import annotations
 
 from typing import Any
 
+import pytest
+
 from wiw.analysis.statistics import estimate_difference, estimate_mean
 from wiw.analysis.summary import Summary, summarise
 from wiw.metrics.metric import SUCCESS
@@ -60,6 +62,13 @@ def test_the_end_of_the_curve_is_the_success_rate() -> None:
 def test_without_answers_an_episode_has_succeeded_from_its_end_on() -> None:
     curve = summarise_answers(ANSWERS, answers=False).breakdowns[0]
     assert [curve.estimates["oracle"][cut].value for cut in curve.keys] == [25, 50, 75]
+
+
+def test_a_part_of_a_success_counts_as_a_part() -> None:
+    rows = [make_outcome("none", i, [0] * i + [1], answers=False) for i in range(3)]
+    rows = [{**row, "metrics": {**row["metrics"], "success": 0.5}} for row in rows]
+    curve = summarise(["none"], rows, 3).breakdowns[0]
+    assert [curve.estimates["none"][cut].value for cut in curve.keys] == pytest.approx([50 / 3, 100 / 3, 50])
 
 
 def test_long_episodes_are_cut_at_some_decisions_and_single_ones_not_at_all() -> None:

@@ -46,9 +46,10 @@ def test_an_episode_that_a_model_wins_comes_first_in_place_of_the_nearest():
 
 def test_a_model_counts_for_more_than_the_ceiling_and_a_placebo_for_nothing():
     found = outcomes(**{"none": {2}, "warp": {25}, "oracle": {8, 9}, "placebo-shuffled:mine": {33}})
-    assert choose_episodes(EPISODES, range(40), found, 2)[0] == 25
+    controls = {"placebo-shuffled:mine"}
+    assert choose_episodes(EPISODES, range(40), found, 2, controls)[0] == 25
     found = outcomes(**{"copy": set(), "oracle": {8}, "placebo-shuffled:mine": {33}})
-    assert choose_episodes(EPISODES, range(40), found, 2)[0] == 8
+    assert choose_episodes(EPISODES, range(40), found, 2, controls)[0] == 8
 
 
 def test_every_kind_keeps_an_episode():

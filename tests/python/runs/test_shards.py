@@ -101,6 +101,18 @@ def test_merged_shards_equal_the_run_of_one_process(tmp_path):
     assert [each["shard"] for each in one.store.info["merged"]] == ["1/3", "2/3", "3/3"]
 
 
+def test_a_merged_run_is_of_the_version_that_ran_its_parts(tmp_path):
+    parts = run_shards(tmp_path / "parts", 2)
+    for part in parts:
+        with closing(sqlite3.connect(store_path(part))) as store, store:
+            store.execute("UPDATE run SET wiw_version = '0.0.9', info = json_remove(info, '$.benchmark')")
+    wiw.merge(parts, tmp_path / "merged")
+    with RunStore.read(tmp_path / "merged") as merged:
+        assert (merged.wiw_version, merged.benchmark) == ("0.0.9", 1)
+    with pytest.raises(StoreError, match=r"0\.0\.9"):
+        resume_run(tmp_path / "merged")
+
+
 def test_with_world_models_pictures_and_scene_maps(tmp_path, two_rooms):
     task = TaskRecipe("imagenav", {"scenes": two_rooms, "decisions": 1, "backend": "cpu"})
 

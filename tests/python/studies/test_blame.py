@@ -180,6 +180,18 @@ def test_some_episodes_then_more_and_nothing_twice(run: Path, blamed: Any) -> No
     assert whole == blamed["spinner"] and before.items() <= again(run).items()
 
 
+def test_a_run_that_has_gained_arms_is_blamed_further(two_rooms: str, tmp_path: Path) -> None:
+    task = TaskRecipe("imagenav", {"scenes": two_rooms, "backend": "cpu", "radius": 0.1, "decisions": 1})
+    arms = {"spinner": AGENTS["spinner"], "oracle": AGENTS["oracle"]}
+    for names in (["spinner"], ["spinner", "oracle"]):
+        own = {name: arms[name] for name in names}
+        options = {"resume": len(own) > 1, "more_arms": True, "salt": "s", "progress": False}
+        run_arms(task, own, 2, out=tmp_path / "run", **options).close()
+        found = wiw.blame(tmp_path / "run", names[-1], episodes=1, progress=False)
+        assert [line.arm for line in found.arms] == names[-1:]
+    assert [line.arm for line in wiw.blame(tmp_path / "run", episodes=1, progress=False).arms] == list(arms)
+
+
 def test_infrastructure_is_not_blamed_but_named(
     two_rooms: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: Any
 ) -> None:

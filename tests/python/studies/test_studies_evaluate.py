@@ -6,6 +6,7 @@ import sqlite3
 import subprocess
 import sys
 import time
+from contextlib import closing
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -64,6 +65,34 @@ def test_pictures_are_kept_for_chosen_episodes(reference, tmp_path):
     assert reference.store.info["pictures"] == [1, 7]  # a model wins the first, the other is spread evenly
     assert reference.store.images("warp", 7, 0) and not reference.store.images("warp", 3, 0)
     assert not run(tmp_path / "run", episodes=2, keep_images=0).store.images("warp", 0, 0)
+
+
+def find_pictured(log):
+    return sorted({row["episode"] for row in log.store._rows("SELECT DISTINCT episode FROM image")})
+
+
+def test_a_run_that_a_rule_may_stop_keeps_the_pictures_that_it_names(tmp_path):
+    arms = {"none": LineAgent(0.1), "warp": LineAgent(0.9)}
+
+    def keep(name, until, pictured):
+        options = {"until": until, "look_every": 10, "keep_images": pictured, "progress": False}
+        with closing(run_arms(LineTask(), arms, 20, out=tmp_path / name, **options)) as log:
+            assert find_pictured(log) == sorted(log.store.info["pictures"])
+            return sorted(log.store.info["pictures"])
+
+    for name, until in (("whole", "width<1"), ("stopped", "width<100")):
+        kept = keep(name, until, 3)
+        assert len(kept) == 3 and max(kept) < 10, "of the episodes before the first look"
+    assert keep("all", "width<1", "all") == list(range(20))
+    assert keep("all-stopped", "width<100", "all") == list(range(10))
+
+
+def test_pictures_of_other_episodes_are_not_to_be_had_by_resuming(tmp_path):
+    run(tmp_path / "run", keep_images=1).close()
+    for same in ({}, {"keep_images": 1}):
+        run(tmp_path / "run", resume=True, **same).close()
+    with pytest.raises(StoreError, match="keep_images: the run has 1, now 8"):
+        run(tmp_path / "run", resume=True, keep_images="all")
 
 
 def test_broken_episodes_fail_for_infrastructure_and_the_rest_goes_on(tmp_path):

@@ -68,6 +68,16 @@ def test_every_arm_is_paired_with_the_oracle(table) -> None:
     assert found["error-lag@4"].loss.p_adjusted < 0.05 < found["error-blur@64"].loss.p_adjusted
 
 
+def test_answers_are_compared_by_their_scores() -> None:
+    rows = outcomes()
+    for row in rows:
+        row["metrics"] |= {"success": 0.0, "answer_score": 0.5 + row["metrics"]["success"] / 2}
+    found = summarise_errors("aeqa", "explorer", rows, decisions(), ARMS, [])
+    assert found.label == "Score" and found.references["none"].value == 50
+    losses = {line.arm: line.loss.estimate.value for line in found.lines}
+    assert losses == {arm: pytest.approx(-50 * COST[arm]) for arm in ARMS}
+
+
 def test_costs_are_slopes_through_the_oracle(table) -> None:
     costs = {(each.family, each.measure): each for each in table.costs}
     assert costs["looks", "1 - SSIM"].loss.value == 0

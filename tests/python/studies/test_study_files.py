@@ -19,7 +19,7 @@ from wiw.cli.app import main
 from wiw.errors import ArgumentError, FileError, StoreError
 from wiw.runs.config import RunConfig
 from wiw.studies.evaluate import run_arms
-from wiw.studies.study import _compare
+from wiw.studies.study import StudyPart, _compare
 from wiw.studies.study_file import list_studies, load_study, parse_variables
 
 OWN = """
@@ -239,6 +239,28 @@ def test_the_study_of_language_models_asks_each_server_for_its_part(tmp_path: Pa
     assert "answer b" in asked["other-answers"] and "answer a" in asked["other-revises"]
     assert "move b" in asked["other-revises"] and "propose b" in asked["other-proposes"]
     assert not any(each.endswith(" b") for each in asked["base"])
+
+
+def test_a_line_that_is_no_arms_has_no_rollouts() -> None:
+    """Of questions, tables have a line for the best guess from the text alone."""
+    log: Any = SimpleNamespace(table=lambda: [{"arm": "none"}, {"arm": "blind"}])
+    part = StudyPart(SimpleNamespace(name="here"), log, SimpleNamespace(), (), {"none": 2.0})  # type: ignore[arg-type]
+    assert part.as_dict()["arms"] == [{"arm": "none", "rollouts": 2.0}, {"arm": "blind"}]
+
+
+def test_the_small_version_has_a_folder_of_its_own(own: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.chdir(tmp_path)
+    assert main(["study", str(own), "--small"]) == 0
+    assert [each.name for each in (tmp_path / "runs").iterdir()] == ["study-own-small"]
+
+
+def test_a_control_is_one_whatever_its_name(own: Path, tmp_path: Path) -> None:
+    text = own.read_text().replace("left-out: {when", "control: {model: copy, placebo: swapped}\n      left-out: {when")
+    own.write_text(text)
+    found = wiw.study(own, out=tmp_path / "out", progress=False)
+    roles = {line.name: line.role for line in found.parts[0].numbers.arms}
+    assert roles["control"] == "control: same compute, futures of another episode"
+    assert roles["front"] == roles["around"] == "world model" and roles["none"].startswith("policy without")
 
 
 def test_pairs_of_a_run_that_was_looked_at_have_the_p_of_bets(tmp_path: Path) -> None:
