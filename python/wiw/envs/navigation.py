@@ -29,8 +29,7 @@ from wiw.envs.spaces import (
     observation_space,
 )
 from wiw.errors import ArgumentError
-from wiw.perception.semantics import TrueSemantics
-from wiw.perception.simulator import read_categories
+from wiw.perception.semantics import TrueSemantics, read_semantic_categories
 from wiw.types import Answer, Episode, Goal, Key, Observation, TextAnswer, Truth
 
 
@@ -193,7 +192,7 @@ class NavigationEnv(gymnasium.Env[dict[str, Any], int], Env):
 
         For agents that are granted the simulator's semantics, as others are granted depth.
         """
-        source = TrueSemantics(read_categories(self.state.world.scene))
+        source = TrueSemantics(read_semantic_categories(self.state.world.scene))
         ids = self._core.observe(["panorama_ids"])["panorama_ids"]
         return source.label_panoramas(self.observation.panorama[None], ids=ids[None])[0]
 

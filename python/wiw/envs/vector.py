@@ -61,6 +61,7 @@ class VectorEnv(gymnasium.vector.VectorEnv[dict[str, Any], NDArray[np.int64], ND
         self._core: Any = None
         self._states: list[EpisodeState] = []
         self._goals: list[Goal] = []
+        self._keys: list[Key] = []
         self._over = np.zeros(num_envs, bool)
         self._front: NDArray[np.uint8] | None = None
         self._next = 0
@@ -86,20 +87,23 @@ class VectorEnv(gymnasium.vector.VectorEnv[dict[str, Any], NDArray[np.int64], ND
         self._states, self._goals = [state for _, state, _ in started], [goal for _, _, goal in started]
         self._over[:] = False
         self._next = max(numbers) + 1  # not of `indices`: after a wrap the next one is not the first again
+        self._keys = [Key(self.task.seed, index) for index in indices]
         infos: dict[str, Any] = {}
-        for place, index in enumerate(indices):
-            self._add_info(infos, self._info(index), place)
+        for place, key in enumerate(self._keys):
+            self._add_info(infos, {"key": key}, place)
         return self._observe(), infos
 
     def step(
         self, actions: ArrayLike
     ) -> tuple[dict[str, Any], NDArray[np.float64], NDArray[np.bool_], NDArray[np.bool_], dict[str, Any]]:
-        """Carry out an action each, numbered as in `NavigationEnv.step`."""
+        """Carry out an action each, numbered as in `NavigationEnv.step`; `infos["key"]` identifies the next
+        decisions.
+        """
         self._require_episodes()
         primitives, answers = self._decode(actions)
         infos: dict[str, Any] = {}
         for place in np.flatnonzero(self._over):
-            self._add_info(infos, self._start_over(int(place)), int(place))
+            self._start_over(int(place))
         self._core.step(np.where(self._over, NULL, primitives).astype(np.int8))
         rewards = np.zeros(self.num_envs)
         terminated, truncated = np.zeros(self.num_envs, bool), np.zeros(self.num_envs, bool)
@@ -110,6 +114,9 @@ class VectorEnv(gymnasium.vector.VectorEnv[dict[str, Any], NDArray[np.int64], ND
             else:
                 state.record_answer(self.task, answer, final=True)
             state.observed.append(len(state.positions) - 1)
+            self._keys[place] = self._keys[place].at(self._keys[place].decision + 1)
+        for place, key in enumerate(self._keys):
+            self._add_info(infos, {"key": key}, place)
         observation = self._observe()
         for place in np.flatnonzero(~self._over):
             state = self._states[place]
@@ -151,15 +158,11 @@ class VectorEnv(gymnasium.vector.VectorEnv[dict[str, Any], NDArray[np.int64], ND
 
     # ------------------------------------------------------------------------------------------------------------------
 
-    def _start_over(self, place: int) -> dict[str, Any]:
-        """Put the next episode in a place; return what its info says."""
+    def _start_over(self, place: int) -> None:
+        """Put the next episode in a place."""
         index = wrap_episode(self.task, self._next)
         self._core[place], self._states[place], self._goals[place] = start_episode(self.task, self.task.episode(index))
-        self._next = index + 1
-        return self._info(index)
-
-    def _info(self, index: int) -> dict[str, Any]:
-        return {"key": Key(self.task.seed, index)}
+        self._keys[place], self._next = Key(self.task.seed, index), index + 1
 
     def _observe(self) -> dict[str, Any]:
         images = self._core.observe(self._images)

@@ -59,8 +59,11 @@ class RedNet(Semantics):
         self._model, self.device = _load_network(self.weights, device)
 
     def describe(self) -> dict[str, Any]:
-        """Return what the labels depend on."""
-        return {**super().describe(), "weights": self.weights.name, "face": self.face, "metres": list(self.metres)}
+        """Return what the labels depend on, with a digest of the weights."""
+        from wiw.weight_file import digest
+
+        own = {"weights": digest(self._model.state_dict()), "face": self.face, "metres": list(self.metres)}
+        return {**super().describe(), **own}
 
     def label_panoramas(
         self,

@@ -21,30 +21,47 @@ CATEGORIES = (
 """Category names by id, from 0 for nothing to 40."""
 SYNONYMS = {
     "armchair": "chair",
+    "bench": "seating",
     "blind": "blinds",
     "bookshelf": "shelving",
+    "bunk bed": "bed",
+    "ceiling lamp": "lighting",
     "coffee table": "table",
+    "console table": "table",
     "couch": "sofa",
     "desk": "table",
+    "dining chair": "chair",
     "dining table": "table",
+    "door frame": "door",
+    "doorframe": "door",
+    "doorway": "door",
     "dresser": "chest of drawers",
     "floor lamp": "lighting",
     "fridge": "appliances",
+    "kitchen cabinet": "cabinet",
     "kitchen counter": "counter",
+    "kitchen sink": "sink",
     "microwave": "appliances",
     "nightstand": "chest of drawers",
+    "office chair": "chair",
     "oven": "appliances",
     "painting": "picture",
     "pendant lamp": "lighting",
+    "photo": "picture",
     "pillow": "cushion",
+    "pouf": "seating",
     "range hood": "appliances",
     "refrigerator": "appliances",
     "shelf": "shelving",
     "shoe rack": "shelving",
+    "side table": "table",
+    "sideboard": "cabinet",
     "stove": "appliances",
     "table lamp": "lighting",
     "television": "tv monitor",
+    "tv stand": "furniture",
     "wall cabinet": "cabinet",
+    "wall shelf": "shelving",
     "wardrobe": "cabinet",
     "washing machine": "appliances",
 }
@@ -86,7 +103,7 @@ class TrueSemantics(Semantics):
     """The simulator's own labels: each instance's category; 0 where nothing is hit.
 
     Args:
-        categories: id to category; `wiw.perception.simulator.read_categories(scene)`.
+        categories: id to category; `read_semantic_categories(scene)`.
     """
 
     needs = ("ids",)
@@ -110,6 +127,11 @@ class TrueSemantics(Semantics):
             [self.categories.get(int(number), OTHER_CATEGORY) if number else 0 for number in numbers], np.uint32
         )
         return np.asarray(table[places.reshape(ids.shape)])
+
+
+def read_semantic_categories(scene: Any) -> dict[int, str]:
+    """Return the category of each of a scene's instances, by id: Matterport3D's own where its scans have it."""
+    return {each["id"]: each["attributes"].get("mpcat40") or each["category"] for each in scene.instances}
 
 
 def find_category_id(name: str) -> int:

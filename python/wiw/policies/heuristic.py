@@ -4,11 +4,13 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from typing import Any
 
 import numpy as np
 
 from wiw._core import core
 from wiw.action import FORWARD, TURN_LEFT, TURN_RIGHT
+from wiw.errors import ArgumentError
 from wiw.policies.base import Policy, Situation
 from wiw.types import Proposal
 
@@ -19,12 +21,25 @@ class Heuristic(Policy):
     """Samples primitives that never undo the previous one and never turn the same way more than four times in a row.
 
     Source: paper, appendix "Policies in Embodied Tasks". It proposes only; `matcher` is its default reviser.
+
+    Args:
+        max_turns: turns the same way in a row, at most.
+
+    Raises:
+        ArgumentError: `max_turns` below 1.
     """
 
     default_revision = "matcher"
 
     def __init__(self, max_turns: int = 4) -> None:
+        if isinstance(max_turns, bool) or not isinstance(max_turns, int) or max_turns < 1:
+            raise ArgumentError(f"policy heuristic: expected a whole max_turns of at least 1, got {max_turns!r}")
         self.max_turns = max_turns
+
+    def describe(self) -> dict[str, Any]:
+        """Return a JSON-able identity, with `max_turns` where it is not the paper's."""
+        own = super().describe()
+        return own if self.max_turns == 4 else {**own, "max_turns": self.max_turns}
 
     def propose(self, situations: Sequence[Situation], candidates: int, horizon: int) -> list[list[Proposal]]:
         """Return independent random plans, keyed by (seed, episode, decision, candidate); the first is the base

@@ -104,7 +104,10 @@ class Manipulation(ManipulationSpec, Task):
             "robot": lambda file: str(Path(file).expanduser().absolute()),
         }
         given = {"backend": "auto", **options}
-        return {name: ways[name](value) if name in ways else value for name, value in given.items()}
+        return {
+            name: ways[name](value) if name in ways and value not in (None, "") else value
+            for name, value in given.items()
+        }
 
     @property
     def actions(self) -> int:

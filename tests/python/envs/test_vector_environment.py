@@ -45,6 +45,7 @@ def test_it_sees_what_single_environments_see(two_rooms: str) -> None:
         assert [(s[1], s[2], s[3]) for s in stepped] == list(zip(rewards, terminated, truncated, strict=True))
         if terminated.any():
             break
+        assert infos["key"].tolist() == [step[4]["key"] for step in stepped]
         np.testing.assert_array_equal(vector.truth(1).position, singles[1].truth().position)
         np.testing.assert_array_equal(vector.render()[2], singles[2].render())
     for goal, env in zip(vector.goals, singles, strict=True):
@@ -63,7 +64,7 @@ def test_an_episode_that_ends_starts_over_at_the_next_step(two_rooms: str) -> No
 
     observations, rewards, terminated, truncated, infos = vector.step([turn, stop, turn])
     assert not terminated.any() and "result" not in infos  # the stop was ignored
-    assert infos["key"][1] == Key(3, PLACES) and infos["_key"].tolist() == [False, True, False]
+    assert infos["key"].tolist() == [Key(3, 0, 2), Key(3, PLACES), Key(3, 2, 2)]
     alone, _ = vector.task.environment(depth=True).reset(options={"episode": PLACES})
     for name, values in alone.items():
         np.testing.assert_array_equal(values, observations[name][1])

@@ -11,6 +11,7 @@ import threading
 import time
 from collections.abc import Iterator, Sequence
 from http.server import BaseHTTPRequestHandler, HTTPServer
+from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
@@ -21,7 +22,13 @@ from wiw.errors import ArgumentError, ContractError, RemoteError
 from wiw.perception.boxes import find_box
 from wiw.perception.detection import Detections, Detector, compute_iou, suppress_duplicates
 from wiw.perception.segmentation import Segmenter
-from wiw.perception.semantics import CATEGORIES, OTHER_CATEGORY, TrueSemantics, find_category_id
+from wiw.perception.semantics import (
+    CATEGORIES,
+    OTHER_CATEGORY,
+    TrueSemantics,
+    find_category_id,
+    read_semantic_categories,
+)
 from wiw.perception.simulator import read_categories
 from wiw.registry import DETECTORS, SEGMENTERS, SEMANTICS
 
@@ -150,6 +157,23 @@ def test_truth_of_a_rendered_scene_agrees_with_itself() -> None:
         assert find_box(mask) == tuple(box)
     true = SEMANTICS.make("simulator", categories=categories).label_panoramas(shown["color"], ids=shown["instance"])
     assert set(np.unique(true)) == {0, CATEGORIES.index("chair"), CATEGORIES.index("bed")}
+
+
+def test_a_scans_own_labels_come_before_words() -> None:
+    """Matterport3D's scans say of each object which of these categories it is."""
+    things = [
+        {"id": 1, "category": "bath cabinet", "attributes": {"mpcat40": "cabinet"}},
+        {"id": 2, "category": "side board", "attributes": {"mpcat40": "chest_of_drawers"}},
+        {"id": 3, "category": "ceiling lamp", "attributes": {}},
+    ]
+    found = read_semantic_categories(SimpleNamespace(instances=things))
+    assert found == {1: "cabinet", 2: "chest_of_drawers", 3: "ceiling lamp"}
+    ids = np.array([[[1, 2], [3, 0]]], np.uint32)
+    labels = TrueSemantics(found).label_panoramas(np.zeros((1, 2, 2, 3), np.uint8), ids=ids)
+    assert [[CATEGORIES[number] for number in row] for row in labels[0]] == [
+        ["cabinet", "chest of drawers"],
+        ["lighting", "void"],
+    ]
 
 
 def test_words_become_categories() -> None:

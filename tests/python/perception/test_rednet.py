@@ -3,6 +3,7 @@
 
 from __future__ import annotations
 
+import shutil
 from pathlib import Path
 from typing import Any
 
@@ -170,6 +171,17 @@ def test_views_are_fed_as_the_weights_were_trained(network: RedNet, checkpoint: 
         np.testing.assert_array_equal(found[row][clear], (scores.argmax(0) + 1).numpy()[clear])
         assert clear.mean() > 0.9
     assert found.dtype == np.uint32
+
+
+def test_it_is_described_by_its_weights_not_by_their_files_name(
+    network: RedNet, checkpoint: Path, tmp_path: Path
+) -> None:
+    same, other = tmp_path / "renamed.pth", tmp_path / checkpoint.name
+    shutil.copy(checkpoint, same)
+    state = {f"module.{name}": value + value.is_floating_point() for name, value in network.state_dict().items()}
+    torch.save({"epoch": 7, "model_state": state}, other)
+    described = [SEMANTICS.make("rednet", weights=each, device="cpu").describe() for each in (checkpoint, same, other)]
+    assert described[0] == described[1] != described[2]
 
 
 def test_panoramas_are_looked_at_by_the_faces_of_their_cube(checkpoint: Path) -> None:

@@ -52,6 +52,16 @@ def test_the_heuristics_rules_hold_across_decisions(history: list[int], decision
             assert whole[i] == FORWARD or i < 4 or len(set(whole[i - 4 : i + 1])) > 1
 
 
+def test_the_heuristics_longest_turn_is_an_option_that_runs_record() -> None:
+    for odd in (0, "3", True, 2.0):
+        with pytest.raises(ArgumentError, match="expected a whole max_turns of at least 1"):
+            wiw.policy("heuristic", max_turns=odd)
+    assert wiw.policy("heuristic", max_turns=2).describe() == {"policy": "Heuristic", "max_turns": 2}
+    assert wiw.policy("heuristic").describe() == {"policy": "Heuristic"}
+    allowed = wiw.policy("heuristic", max_turns=1).list_allowed
+    assert allowed([FORWARD]) == [FORWARD, TURN_LEFT, TURN_RIGHT] and allowed([TURN_LEFT]) == [FORWARD]
+
+
 def test_the_heuristic_draws_anew_for_each_decision_and_candidate() -> None:
     policy = wiw.policy("heuristic")
     plans = {
@@ -185,6 +195,32 @@ def test_a_refused_step_makes_what_is_ahead_solid() -> None:
     assert exploration.look_ahead(np.zeros(3), 1, 1.0)[0][0] == 1.0
     exploration.mark_blocked(np.zeros(3))
     assert exploration.look_ahead(np.zeros(3), 1, 1.0)[0][0] < 3 * CELL
+
+
+def test_a_plan_of_which_only_the_turn_was_carried_out_marks_nothing() -> None:
+    """It has not tried to go where its second step would have led."""
+    depth = corridor()[1].repeat(8, 1)[:576].repeat(2, 0)[:576]
+    goal, free = Goal("imagenav", image=noise(480, 480, 3, seed=2)), []
+    for executed in ((int(TURN_LEFT),), (int(TURN_LEFT), int(FORWARD))):
+        policy = Matcher()
+        memory = policy.begin(goal, Key(0, 0))
+        memory.last_plan = np.array([TURN_LEFT, FORWARD, FORWARD], np.int8)
+        for done, azimuth in (((), 0.0), (executed, np.pi / 8)):
+            shown = Observation(noise(576, 1024, 3), BLANK.front, np.array([0.0, 0.0, azimuth]), depth)
+            policy.observe([Situation(shown, goal, Key(0, 0), memory, done)])
+        free.append(memory.map.look_ahead(np.array([0.0, 0.0, np.pi / 8]), 1, 1.0)[0][0])
+    assert free[0] > free[1] and free[1] < 3 * CELL
+
+
+@pytest.mark.parametrize("size", [(64, 128), (100, 200), (288, 512), (576, 1024)])
+def test_the_matcher_reads_panoramas_of_other_sizes(size: tuple[int, int]) -> None:
+    depth = np.full(size, 2.0, np.float32)
+    goal = Goal("imagenav", image=noise(480, 480, 3, seed=2))
+    policy = Matcher()
+    shown = Observation(noise(*size, 3), BLANK.front, np.zeros(3), depth)
+    situation = Situation(shown, goal, Key(0, 0), policy.begin(goal, Key(0, 0)))
+    policy.observe([situation])
+    assert len(policy.propose([situation], 3, 5)[0]) == 3
 
 
 @pytest.mark.parametrize("name", ["matcher", "climber", "geometric"])

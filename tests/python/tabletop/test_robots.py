@@ -90,6 +90,7 @@ def test_a_task_names_its_robot(other: Path, monkeypatch: pytest.MonkeyPatch) ->
     assert task.set_table(task.episode(0)).bench.robot is task.robot
     monkeypatch.chdir(other.parent)
     assert Manipulation.make_portable({"robot": "acme.urdf"})["robot"] == str(other)
+    assert Manipulation.make_portable({"robot": None})["robot"] is None
 
 
 @pytest.mark.parametrize(

@@ -76,6 +76,8 @@ class Memory:
     """By plan proposed last: the gain in similarity that earlier imagination promised for it."""
     last_plan: NDArray[np.int8] | None = None
     """The plan chosen last; if it did not move the agent, something unseen is in the way."""
+    executed: int = 0
+    """Primitives that had been executed at the latest observation."""
     places: list[tuple[NDArray[np.float64], float]] = field(default_factory=list)
     """Odometry and similarity of every place the agent has really visited."""
 
@@ -118,9 +120,10 @@ class Matcher(Policy):
             likeness = self._measure_place(memory, bands.take(i))
             observation = situation.observation
             assert observation.depth is not None
-            if memory.last_plan is not None and FORWARD in memory.last_plan[:2]:
+            executed, memory.executed = situation.executed[memory.executed :], len(situation.executed)
+            if memory.last_plan is not None and FORWARD in memory.last_plan[:2] and FORWARD in executed:
                 memory.map.mark_blocked(observation.odometry)
-            memory.map.update(observation.depth[1::2, 4::8], observation.odometry, likeness)
+            memory.map.update(_sample_depth(observation.depth), observation.odometry, likeness)
             memory.places.append((observation.odometry, memory.similarity))
 
     def propose(self, situations: Sequence[Situation], candidates: int, horizon: int) -> list[list[Proposal]]:
@@ -214,6 +217,12 @@ class Matcher(Policy):
             - options.turn * turns
         )
         return prior - 2.0 * (runs < STEP), runs
+
+
+def _sample_depth(depth: NDArray[np.float32]) -> NDArray[np.float32]:
+    """Return every other row of a panorama's depth [H, W], and the columns in which likeness is measured."""
+    width = depth.shape[1]
+    return depth[1::2, (2 * np.arange(appearance.COLUMNS) + 1) * width // (2 * appearance.COLUMNS)]
 
 
 def _extract_bands(situations: Sequence[Situation]) -> appearance.Band:
