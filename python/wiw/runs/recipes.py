@@ -187,10 +187,15 @@ class AgentRecipe(AgentConfig):
 
     def without_secrets(self) -> AgentRecipe:
         """Return the same agent without servers' keys and tokens: records are shown and passed on."""
-        policies = {
-            name: _leave_out(own, "key") if name == "vlm" or "vlm" in own else own
-            for name, own in self.policy_options.items()
-        }
+        policies: dict[str, Any] = dict(self.policy_options)
+        for name, own in self.policy_options.items():
+            if name == "vlm" or "vlm" in own:
+                policies[name] = _leave_out(own, "key")
+                if isinstance(roles := own.get("roles"), Mapping):  # anything else is refused by the policy
+                    policies[name]["roles"] = {
+                        role: _leave_out(each, "key") if isinstance(each, Mapping) else each
+                        for role, each in roles.items()
+                    }
         named = self.model if isinstance(self.model, str) else ""
         is_own = named in WORLD_MODELS.built_in or named.startswith("remote:")  # others may mean something else by it
         options = _leave_out(self.model_options, "token") if is_own else self.model_options

@@ -21,7 +21,7 @@ import wiw
 from misbehaviour import MisbehavingVlmServer, Misbehaviour
 from recognition_file import a_file
 from wiw.cli import main
-from wiw.errors import ArgumentError, PromptError
+from wiw.errors import ArgumentError, PromptError, VlmError
 from wiw.loop.memory import Query
 from wiw.policies.vlm import presets, prompt_images
 from wiw.policies.vlm.policy import VLM
@@ -92,6 +92,8 @@ def test_imagined_frames_may_be_images_of_their_own_and_without_captions(two_roo
         policy = VLM(client, tracker=None, shown=shown, captions=captions)
         decide_in(imagenav(two_rooms), policy, "copy", candidates=1)
         shapes[shown, captions] = [image.shape[:2] for image in images(client.calls[-1])[1:]]
+        assert ("a row of frames" in words(client.calls[-1])) == (shown == "strip"), "the prompt says what is shown"
+        assert ("in a bar at its top" in words(client.calls[-1])) == captions
     side, bar = prompt_images.VIEW, shapes["frames", True][0][0] - prompt_images.VIEW
     assert shapes["strip", False] == [(side, 3 * side)] and shapes["frames", False] == [(side, side)] * 3
     assert bar > 10 and shapes["frames", True] == [(side + bar, side)] * 3 and shapes["strip", True][0][0] > side
@@ -113,6 +115,54 @@ def test_roles_may_have_models_of_their_own(two_rooms: str) -> None:
     for roles, model in (({"revise": {"model": "b"}}, None), ({"judge": {"model": "b"}}, "a"), ({"revise": {}}, "a")):
         with pytest.raises(ArgumentError, match="expected roles among propose, revise, answer"):
             VLM(MockClient(), model=model, roles=roles)
+
+
+def test_the_main_servers_key_is_not_sent_to_a_roles_own(two_rooms: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.delenv("OPENAI_API_KEY", raising=False)
+    kept = {"model": "mock", "key": "main", "cache": "off", "attempts": 1, "tracker": None}
+
+    def decide_with(url: str, role: dict[str, Any]) -> Any:
+        policy = VLM(url, roles={"revise": {"model": "mock", **role}}, **kept)
+        return decide_in(imagenav(two_rooms), policy, "copy", candidates=1)
+
+    def serve(token: str) -> VlmServer:
+        return VlmServer(MockClient(script), token=token)
+
+    with serve("main") as main, serve("own") as other:
+        assert decide_with(main.url, {}).chosen == 0, "the same server, the same key"
+        assert decide_with(main.url, {"vlm": main.url}).chosen == 0
+        assert decide_with(main.url, {"vlm": other.url, "key": "own"}).chosen == 0
+    with serve("main") as main, serve("main") as other, pytest.raises(VlmError, match="401"):
+        decide_with(main.url, {"vlm": other.url})
+    with pytest.raises(ArgumentError, match="optionally its own vlm and key") as error:
+        VLM("mock", roles={"revise": {"key": "canary"}})
+    assert "canary" not in str(error.value)
+
+
+def test_options_of_the_main_server_do_not_override_the_preset_of_another() -> None:
+    preset, main, other = presets.list_names()[0], "http://localhost:1/v1", "http://localhost:2/v1"
+
+    def connect_role(**role: Any) -> Any:
+        given = {"dialect": "legacy", "top_logprobs": 5, "timeout": 7.0}
+        return VLM(main, model="a", cache="off", roles={"revise": role}, **given).roles["revise"]
+
+    apart, same = connect_role(vlm=other, model=preset), connect_role(model=preset)
+    assert (apart.base_url, apart.dialect, apart.top_logprobs, apart.concurrency) == (other, "vllm", 20, 16)
+    assert (same.base_url, same.dialect, same.top_logprobs, same.concurrency) == (main, "legacy", 5, 16)
+    assert apart.timeout == same.timeout == 7.0, "no preset says how long to wait"
+    assert connect_role(vlm=other, model="b").dialect == "legacy"
+
+
+def test_recipes_leave_out_the_keys_of_roles() -> None:
+    roles = {"revise": {"vlm": "http://b/v1", "model": "b", "key": "canary"}, "answer": {"model": "c"}}
+    options = {"vlm": "http://a/v1", "model": "a", "key": "canary", "roles": roles}
+    recipe = AgentRecipe("vlm", policy_options={"vlm": options})
+    assert "canary" not in str(recipe.to_json()) and "canary" not in str(recipe.describe())
+    told = recipe.without_secrets().policy_options["vlm"]["roles"]
+    assert told == {"revise": {"vlm": "http://b/v1", "model": "b"}, "answer": {"model": "c"}}
+    assert recipe.policy_options["vlm"]["roles"]["revise"]["key"] == "canary", "the agent itself keeps it"
+    wrong = AgentRecipe("vlm", policy_options={"vlm": {"model": "a", "roles": {"revise": "b"}}})
+    assert wrong.without_secrets() == wrong, "refused by the policy, which says why"
 
 
 def test_without_a_world_model_one_plan_is_asked_for(two_rooms: str) -> None:
@@ -186,6 +236,19 @@ def test_recognition_asks_for_category_and_primitive(recognition: Any) -> None:
     assert decision.answer.label == "table" and decision.answer.probabilities.max() == pytest.approx(1.0)
     assert decision.answer.confidence == pytest.approx(0.9), "as the model gave it"
     assert decision.chosen == 0 and decision.actions[0] == FORWARD and decision.execute == 1
+
+
+def test_views_of_perspective_models_are_not_said_to_be_centred_on_the_target(recognition: Any) -> None:
+    def rollout(observations: Any, controls: Any, seeds: Any) -> Any:
+        return np.repeat(observations.image[:, None], len(controls[0].actions) + 1, axis=1)
+
+    for view, centred in (("panorama", True), ("perspective", False)):
+        client = MockClient(script)
+        model = wiw.world_model(rollout, accepts=wiw.accepts("trajectory", view))
+        decide_in(recognition, VLM(client), model)
+        answering = words(client.calls[-1])
+        assert ("centred on the same thing" in answering) == centred and "Imagined views 1" in answering
+        assert ("row of front views" in answering) == (not centred)
 
 
 @pytest.mark.parametrize("side", [384, 512])

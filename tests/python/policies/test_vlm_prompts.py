@@ -3,13 +3,14 @@
 
 from __future__ import annotations
 
+import itertools
 import pickle
 from pathlib import Path
 
 import pytest
 
 from wiw.errors import PromptError
-from wiw.policies.vlm.prompts.templates import FOLDER, SLOTS, Prompts, get_slots, list_tasks
+from wiw.policies.vlm.prompts.templates import FOLDER, SETS, SLOTS, Prompts, get_slots, list_tasks
 
 LOOP = "{% for a in range(99999) %}"
 
@@ -78,3 +79,47 @@ def test_shipped_templates_say_the_same_as_a_users(tmp_path: Path, task: str) ->
         text = own.render(task, file.stem, **slots)
         assert text == shipped.render(task, file.stem, **slots) and text
     assert own.digest == shipped.digest
+
+
+IMAGINED = (("ar", "planner_imagined"), ("imagenav", "planner_imagined"), ("imagenav", "chooser"))
+"""Prompts that come with the frames of plans."""
+
+
+@pytest.mark.parametrize("name", SETS)
+@pytest.mark.parametrize(("task", "question"), IMAGINED)
+def test_prompts_say_how_frames_are_shown(name: str, task: str, question: str) -> None:
+    for shown, captions in itertools.product(("strip", "frames"), (True, False)):
+        text = Prompts(name).render(task, question, **{**SLOTS, "shown": shown, "captions": captions})
+        assert ("row of" in text) == (shown == "strip") and ("one picture a frame" in text) == (shown == "frames")
+        assert ("number and name of the action" in text) == captions
+        assert ("in the order of the plan's actions." in text) == (not captions)
+
+
+@pytest.mark.parametrize("name", SETS)
+def test_prompts_say_whether_views_are_centred_on_the_target(name: str) -> None:
+    for shown, centred in itertools.product(("strip", "frames"), (True, False)):
+        text = Prompts(name).render("ar", "answerer_imagined", **{**SLOTS, "shown": shown, "centred": centred})
+        assert ("front view" in text) == (not centred) and "boxed in red" in text
+        assert name == "minimal" or ("centred on the same thing" in text) == centred
+        assert ("row of" in text or "belongs to one plan" in text) == (shown == "strip")
+
+
+def test_prompts_describe_strips_of_panoramic_models_where_nothing_else_is_asked_for() -> None:
+    said = {
+        ("ar", "planner_imagined"): "one picture a plan, a row of frames, each with the number and name of the action "
+        "that leads to it in a bar at its top.\n",
+        ("imagenav", "chooser"): "a picture with a row of frames, each with the number and name of the action that "
+        "leads to it in a bar at its top. Imagined frames",
+        ("ar", "answerer_imagined"): "each picture is a row of views that a model predicts for places near by, all "
+        "centred on the same thing and boxed in red.\n",
+    }
+    for (task, question), words in said.items():
+        assert words in Prompts().render(task, question, **SLOTS)
+
+
+def test_a_users_template_may_use_the_slots_of_what_is_shown_or_leave_them(tmp_path: Path) -> None:
+    own_prompt(tmp_path, "Walk {{ look_ahead_action_num }}!")
+    (tmp_path / "imagenav/chooser.j2").write_text("{{ shown }}, {{ captions }}, {{ centred }}")
+    own, slots = Prompts(tmp_path), {**SLOTS, "captions": False}
+    assert own.render("imagenav", "planner", **slots) == "Walk 5!"
+    assert own.render("imagenav", "chooser", **slots) == "strip, False, True"

@@ -378,6 +378,31 @@ def test_what_stands_behind_straight_steps_is_said(two_rooms: str) -> None:
     assert decision.actions.tolist() == walked and decision.scores.argmax() == 1 and decision.chosen is None
 
 
+def test_the_command_that_was_written_is_followed_though_another_is_imagined_alike(two_rooms: str) -> None:
+    ahead, written = command("front", plan="Walk on."), without_answer(command("front", plan="Only turn round."))
+    steps = iter([[("forward", 4)], [("turn_left", 4)]])
+    script = Script(ahead, revision=written)
+
+    def answer(call: Call) -> Any:
+        script.steps = next(steps) if level(call) == "walk" else script.steps
+        return script(call)
+
+    policy = make_policy(answer, imagined="straight")
+    decision = decide(two_rooms, policy, "copy", candidates=1)
+    assert decision.proposals[0].actions.tolist() == [int(FORWARD)] * 13 and decision.proposals[0].note == "Walk on."
+    assert decision.actions.tolist() == [LEFT] * 4 and decision.chosen is None
+
+
+def test_an_answer_that_does_not_count_cuts_no_plan_short(two_rooms: str) -> None:
+    """Only the first of several samples may answer."""
+    far = [("forward", 4), ("turn_left", 1), ("forward", 4)]
+    script = Script(
+        command("right"), command("back", answer="red"), revision=without_answer(command("right")), steps=far
+    )
+    decision = decide(two_rooms, make_policy(script), "copy", candidates=2)
+    assert [len(plan.actions) for plan in decision.proposals] == [4 + 9, 8 + 9] and decision.answer.text == ""
+
+
 def test_an_answer_is_looked_at_again_where_straight_steps_are_imagined(two_rooms: str) -> None:
     policy = make_policy(Script(command(landmark=1, answer="red")), imagined="straight", longest_route=50)
     decision = decide(two_rooms, policy, "copy")

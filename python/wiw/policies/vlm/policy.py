@@ -99,10 +99,12 @@ class VLM(Policy):
         captions: whether a bar above each imagined frame says which action it follows.
         roles: who is asked the questions of a role, where it is not `model` at `vlm`: {"revise": {"vlm": URL, "model":
             NAME}}. Roles are "propose" (plans, before anything is imagined), "revise" (which plan, or primitive, to
-            follow) and "answer" (the category, or the answer to a question).
+            follow) and "answer" (the category, or the answer to a question). A role may have a `key` of its own; a
+            `vlm` of its own is never sent that of the main one.
         cache: where answers are kept, so that none is paid for twice: "auto" (`~/.cache/wiw/replies`), a folder, "off".
         prices: YAML file of `model: [read, written]`, dollars per million tokens.
-        client: further options of the client, such as `dialect` and `concurrency`.
+        client: further options of the client, such as `dialect`, `concurrency` and `key`. At a role's own `vlm`, the
+            preset of the role's model comes before them.
 
     Raises:
         ArgumentError: an option out of range, or one that the client does not take.
@@ -176,7 +178,7 @@ class VLM(Policy):
         kept = {"cache": open_reply_cache(cache), "prices": table} if isinstance(vlm, str) else {}
         self.client = connect(vlm, **{**kept, **presets.get_client_options(model), **client})
         self.roles = {
-            role: connect(own.get("vlm") or vlm, **{**kept, **presets.get_client_options(own["model"]), **client})
+            role: connect(own.get("vlm") or vlm, **{**kept, **_get_role_options(own, vlm, client)})
             for role, own in _check_roles(roles or {}, model).items()
         }
         self.shown, self.captions = shown, captions
@@ -463,10 +465,11 @@ class VLM(Policy):
                 imagined += self._show_target_frames(number, rollout, track)
         if not real and not imagined:
             return []
-        words = OBSERVATION_WORDS if self.answer_view == "observation" else TARGET_WORDS
-        parts: list[Part] = [self._fill_template(situation.goal.task, "answerer", words), *real]
-        if imagined:
-            parts += [self._render_prompt(situation, "answerer_imagined", 1), *imagined]
+        task, words = situation.goal.task, OBSERVATION_WORDS if self.answer_view == "observation" else TARGET_WORDS
+        parts: list[Part] = [self._fill_template(task, "answerer", words), *real]
+        if rollouts is not None and imagined:
+            centred = rollouts[0].view == "panorama"  # the tracker takes no plans in different views
+            parts += [self._fill_template(task, "answerer_imagined", OBSERVATION_WORDS, centred=centred), *imagined]
         seed = derive_seed(situation.key, _ANSWER_SEED)
         choices = situation.goal.choices
         return [Request((user(*parts),), choices=choices, rounds=self.rounds, seed=seed, tries=self.tries)]
@@ -535,10 +538,20 @@ class VLM(Policy):
     def _render_prompt(self, situation: Situation, name: str, horizon: int, count: int = 1) -> str:
         return self._fill_template(situation.goal.task, name, OBSERVATION_WORDS, horizon, count)
 
-    def _fill_template(self, task: str, name: str, shown: str, horizon: int = 1, count: int = 1) -> str:
-        """Return a question about images that are `shown`, in words."""
+    def _fill_template(
+        self, task: str, name: str, words: str, horizon: int = 1, count: int = 1, centred: bool = False
+    ) -> str:
+        """Return a question about an observation in `words`, and imagined views that may be `centred`."""
         return self.prompts.render(
-            task, name, obs_key=shown, look_ahead_action_num=horizon, plan_num=count, actions=plans.MEANINGS
+            task,
+            name,
+            obs_key=words,
+            look_ahead_action_num=horizon,
+            plan_num=count,
+            actions=plans.MEANINGS,
+            shown=self.shown,
+            captions=self.captions,
+            centred=centred,
         )
 
     def _describe_reading(self, reply: Reply) -> dict[str, Any]:
@@ -568,15 +581,30 @@ def _check_roles(roles: Mapping[str, Mapping[str, Any]], model: str | None) -> M
     """Return the roles as they are.
 
     Raises:
-        ArgumentError: another role, other options than vlm and model, or a model without a name.
+        ArgumentError: another role, other options than vlm, model and key, or a model without a name.
     """
-    fits = all(role in ROLES and "model" in own and set(own) <= {"vlm", "model"} for role, own in roles.items())
+    fits = all(role in ROLES and "model" in own and set(own) <= {"vlm", "model", "key"} for role, own in roles.items())
     if not fits or (roles and model is None):
         raise ArgumentError(
-            f"policy vlm: expected roles among {', '.join(ROLES)}, each with a model and optionally its own vlm, and "
-            f"the model's name for all others (model=, --vlm-model), got roles={roles}, model={model}"
+            f"policy vlm: expected roles among {', '.join(ROLES)}, each with a model and optionally its own vlm and "
+            "key, and the model's name for all others (model=, --vlm-model), got "
+            f"roles={ {role: _leave_out_key(own) for role, own in roles.items()} }, model={model}"
         )
     return roles
+
+
+def _leave_out_key(options: Any) -> Any:
+    """Return the options of a server without its key; anything else as it is."""
+    return {name: options[name] for name in options if name != "key"} if isinstance(options, Mapping) else options
+
+
+def _get_role_options(own: Mapping[str, Any], vlm: Any, client: Mapping[str, Any]) -> dict[str, Any]:
+    """Return the client's options for a role, where `client` are those given for the main `vlm`."""
+    preset, key = presets.get_client_options(own["model"]), {} if own.get("key") is None else {"key": own["key"]}
+    if (own.get("vlm") or vlm) == vlm:
+        return {**preset, **client, **key}
+    # what was given describes the main server, and its key is for nobody else
+    return {**_leave_out_key(client), **preset, **key}
 
 
 def derive_seed(key: Key, number: int) -> int:

@@ -5,11 +5,14 @@ There are sets of them. `default` lies here; `minimal`, in a folder of its own, 
 advice. A user's own folder may replace either (`wiw prompts import` makes one of a copy of the paper).
 
 Slots of all tasks: `look_ahead_action_num` (actions of a plan) and `plan_num` (number of plans requested). Navigation
-and recognition: `obs_key` (the observation in words) and `actions` (name to meaning). Manipulation: `position_bins`,
-`rotation_bins` and `rotation_degrees` (as `wiw.action.PoseGrid`), `table_height` (Z of its top), `colours` (names),
-`instruction`, `objects` (index to [X, Y, Z]), `gripper` (its pose) and `executed` (actions so far). Question answering:
-`obs_key`, `question`, `detected_objs` (view to number to name), `history` (plans so far, in words), `actions`,
-`action_times` (how often one may be repeated) and `high_level_plan` (what the low-level planner is to carry out).
+and recognition: `obs_key` (the observation in words), `actions` (name to meaning), `shown` ("strip" where a plan's
+imagined frames are one picture, "frames" where each is a picture of its own), `captions` (whether a bar above each says
+what it is) and `centred` (whether imagined views are centred on the target; otherwise they are front views).
+Manipulation: `position_bins`, `rotation_bins` and `rotation_degrees` (as `wiw.action.PoseGrid`), `table_height` (Z of
+its top), `colours` (names), `instruction`, `objects` (index to [X, Y, Z]), `gripper` (its pose) and `executed` (actions
+so far). Question answering: `obs_key`, `question`, `detected_objs` (view to number to name), `history` (plans so far,
+in words), `actions`, `action_times` (how often one may be repeated) and `high_level_plan` (what the low-level planner
+is to carry out). A template uses those that it needs.
 
 The shipped templates are filled here, a user's in a process with limits on time, memory and length
 (`wiw.vlm.template_filler`).
@@ -38,6 +41,9 @@ SLOTS: dict[str, Any] = {
     "look_ahead_action_num": 5,
     "plan_num": 1,
     "actions": {"forward": "go straight for 0.20 m"},
+    "shown": "strip",
+    "captions": True,
+    "centred": True,
 }
 """Every slot of navigation and recognition, with a value to test templates with."""
 ARM_SLOTS: dict[str, Any] = {

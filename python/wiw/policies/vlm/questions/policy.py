@@ -38,6 +38,17 @@ WALK_SEED, ANSWER_SEED = 0x77616C6B, 0x73617973
 NO_WALK = "the robot only turns to the view"
 
 
+@dataclass(frozen=True)
+class PlannedCommand:
+    """A command of the high-level planner, and the primitives that it became."""
+
+    command: Command
+    plan: Proposal
+    """What is imagined."""
+    way: NDArray[np.int8]
+    """What is carried out: the plan, unless a route goes on or other steps are imagined."""
+
+
 @dataclass(kw_only=True)
 class QuestionMemory(Memory):
     """The memory of one episode."""
@@ -45,10 +56,8 @@ class QuestionMemory(Memory):
     home: HomeMap
     sight: Sight | None = None
     """View of the present decision."""
-    commands: dict[bytes, Command] = field(default_factory=dict)
-    """Commands of the present decision by the plans that they became."""
-    ways: dict[bytes, NDArray[np.int8]] = field(default_factory=dict)
-    """What is carried out of each of these plans, where that is more or other than the plan."""
+    planned: dict[bytes, PlannedCommand] = field(default_factory=dict)
+    """Commands of the present decision by the primitives of their plans."""
     answer: tuple[Key, str] | None = None
     """The planner's latest answer, empty if it gave none, and at which decision."""
     executed: int = 0
@@ -150,7 +159,7 @@ class QuestionVLM(VLM):
             waits = memory.answer is not None and memory.answer[1]  # the task may have asked again at once
             executed = np.array([] if waits else situation.executed[memory.executed :], np.int8)
             memory.sight = memory.home.add(situation.observation, views, own, situation.goal.text or "", executed)
-            memory.executed, memory.commands, memory.ways = len(situation.executed), {}, {}
+            memory.executed, memory.planned = len(situation.executed), {}
 
     # -- plans ---------------------------------------------------------------------------------------------------------
 
@@ -160,9 +169,12 @@ class QuestionVLM(VLM):
         replies = self._ask_each(wanted)
         found = [self._read_commands(situation, own) for situation, own in zip(situations, replies, strict=True)]
         planned = self._plan_commands(list(zip(situations, found, strict=True)))
+        for situation, own in zip(situations, planned, strict=True):
+            for each in own:  # of commands that are imagined alike, the first
+                situation.memory.planned.setdefault(each.plan.actions.tobytes(), each)
         return [
-            _drop_equal(plans) or [self._draw_fallback(situation)]
-            for situation, plans in zip(situations, planned, strict=True)
+            _drop_equal([each.plan for each in own]) or [self._draw_fallback(situation)]
+            for situation, own in zip(situations, planned, strict=True)
         ]
 
     def _build_plan_prompt(self, situation: Situation, horizon: int) -> list[Part]:
@@ -188,11 +200,11 @@ class QuestionVLM(VLM):
         assert memory.sight is not None
         found = [each for reply in usable for each in commands.parse_commands(reply.value, memory.sight.marked)]
         memory.answer = situation.key, found[0].answer if found else ""
-        return found[:1] if memory.answer[1] else found
+        return found[:1] if memory.answer[1] else [replace(each, answer="") for each in found]
 
     # -- the low level -------------------------------------------------------------------------------------------------
 
-    def _plan_commands(self, wanted: Sequence[tuple[Situation, Sequence[Command]]]) -> list[list[Proposal]]:
+    def _plan_commands(self, wanted: Sequence[tuple[Situation, Sequence[Command]]]) -> list[list[PlannedCommand]]:
         """Return the plans of each episode's commands; all walks that they need are asked for at once."""
         requests = [
             [self._build_walk_request(situation, command) for command in own if command.landmark is None]
@@ -204,8 +216,7 @@ class QuestionVLM(VLM):
             for (situation, own), walks in zip(wanted, map(iter, replies), strict=True)
         ]
 
-    def _plan_command(self, situation: Situation, command: Command, walks: Iterator[Reply]) -> Proposal:
-        """Return the plan of a command as it is imagined, and remember what is to be carried out of it."""
+    def _plan_command(self, situation: Situation, command: Command, walks: Iterator[Reply]) -> PlannedCommand:
         memory: QuestionMemory = situation.memory
         pose, horizon = situation.observation.odometry, memory.horizon
         if command.landmark is not None:
@@ -223,9 +234,7 @@ class QuestionVLM(VLM):
             plan = steering.go_straight(turn, horizon)
         else:
             plan = steering.cut_plan(way, horizon)
-        memory.commands.setdefault(plan.tobytes(), command)
-        memory.ways.setdefault(plan.tobytes(), way)
-        return Proposal(plan, note=command.plan)
+        return PlannedCommand(command, Proposal(plan, note=command.plan), way)
 
     def _build_walk_request(self, situation: Situation, command: Command) -> Request:
         words = self._render_prompt(situation, "low_level_planner", commands.WALK_ACTIONS, command=command)
@@ -247,9 +256,17 @@ class QuestionVLM(VLM):
         written = [self._read_revision(situation, own) for situation, own in zip(situations, replies, strict=True)]
         planned = self._plan_commands(list(zip(situations, written, strict=True)))
         return [
-            self._rate_plans(situation, proposed, own[0], plans[0].actions if plans else None) if own else np.ones(1)
+            self._rate_commands(situation, proposed, own[0], plans) if own else np.ones(1)
             for (situation, proposed, _), own, plans in zip(rows, replies, planned, strict=True)
         ]
+
+    def _rate_commands(
+        self, situation: Situation, proposals: Sequence[Proposal], reply: Reply, written: Sequence[PlannedCommand]
+    ) -> NDArray[np.float64]:
+        """Return the plans' scores; the command that was written takes the place of one that is imagined alike."""
+        for each in written:
+            situation.memory.planned[each.plan.actions.tobytes()] = each
+        return self._rate_plans(situation, proposals, reply, written[0].plan.actions if written else None)
 
     def _build_scoring_requests(
         self, situation: Situation, proposals: Sequence[Proposal], rollouts: Sequence[Rollout]
@@ -268,7 +285,7 @@ class QuestionVLM(VLM):
         parts = self._build_plan_prompt(situation, memory.horizon)
         parts.append(self._render_prompt(situation, "chooser" if selects else "planner_imagined", memory.horizon))
         for number, (plan, rollout) in enumerate(zip(proposals, rollouts, strict=True), 1):
-            is_straight = self.imagined == "straight" and plan.actions.tobytes() in memory.commands
+            is_straight = self.imagined == "straight" and plan.actions.tobytes() in memory.planned
             end = STRAIGHT_END if is_straight else prompt_images.describe_end(rollout)
             words = f"Plan {number}: {_describe_plan(memory, plan)}\n{end}:"
             parts += [words, prompt_images.render_end(rollout)]
@@ -300,12 +317,13 @@ class QuestionVLM(VLM):
         """Return the decided plan, and remember its command for later prompts."""
         actions, chosen = super().revise(situation, proposals, scores)
         memory: QuestionMemory = situation.memory
-        command = memory.commands.get(actions.tobytes())
-        if command is not None and not command.answer:
-            memory.history.append(f"after {len(situation.executed)} actions: {command.plan}")
-        way = memory.ways.get(actions.tobytes(), actions)
-        follows = np.array_equal(way[: len(actions)], actions)  # else another plan is carried out than was imagined
-        return way, chosen if follows else None
+        planned = memory.planned.get(actions.tobytes())
+        if planned is None:
+            return actions, chosen
+        if not planned.command.answer:
+            memory.history.append(f"after {len(situation.executed)} actions: {planned.command.plan}")
+        follows = np.array_equal(planned.way[: len(actions)], actions)  # else other steps were imagined
+        return planned.way, chosen if follows else None
 
     # -- answers -------------------------------------------------------------------------------------------------------
 
@@ -372,7 +390,7 @@ def _drop_equal(proposals: Sequence[Proposal]) -> list[Proposal]:
 
 def _describe_plan(memory: QuestionMemory, plan: Proposal) -> str:
     """Return the command behind a plan; of another policy's plan its note and primitives."""
-    command = memory.commands.get(plan.actions.tobytes())
-    if command is not None:
-        return json.dumps(command.to_prompt(), ensure_ascii=False)
+    planned = memory.planned.get(plan.actions.tobytes())
+    if planned is not None:
+        return json.dumps(planned.command.to_prompt(), ensure_ascii=False)
     return f"{plan.note or 'in primitives'}: {', '.join(plans.name_actions(plan.actions))}"
