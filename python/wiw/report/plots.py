@@ -42,6 +42,8 @@ PALETTE = (
     "#4c78a8", "#8e6bbf", "#d1495b", "#17899b", "#b5651d", "#5a7d2a",
     "#d977b0", "#3949ab", "#7c6f00", "#e8743b", "#00a884", "#8d5a4a",
 )  # fmt: skip
+MARKERS = "osD^"
+"""Tell arms of one colour apart."""
 ROLE_COLORS = {"none": "#8b9099", "copy": "#c98a2b", "oracle": "#2e9e6b", BLIND: "#a39a86"}
 BLAME_COLORS = {
     "imagination": "#4c78a8",
@@ -61,6 +63,8 @@ HEIGHT, LINE = 3.1, 0.2
 """Inches: of a plot, and what each line of a name, or row of a legend, needs where that is more."""
 LEGEND_ROWS = 4
 """Rows of a legend for which a plot has room."""
+LEGEND_WIDTH = 50
+"""Characters that fit beside each other in a legend as wide as one plot, of which each entry needs six for its mark."""
 FEW = 24
 """Below this many episodes single outcomes are shown instead of binned rates."""
 
@@ -71,6 +75,12 @@ def arm_colors(arms: Sequence[str]) -> dict[str, str]:
     """Return a colour per arm; the references always have the same."""
     others = [arm for arm in arms if arm not in ROLE_COLORS]
     return {**ROLE_COLORS, **{arm: PALETTE[i % len(PALETTE)] for i, arm in enumerate(others)}}
+
+
+def arm_markers(arms: Sequence[str]) -> dict[str, str]:
+    """Return a marker per arm, which differs between arms of one colour."""
+    others = [arm for arm in arms if arm not in ROLE_COLORS]
+    return {**dict.fromkeys(ROLE_COLORS, "o"), **{arm: MARKERS[i // len(PALETTE) % 4] for i, arm in enumerate(others)}}
 
 
 def success_by_arm(summary: Summary) -> Markup:
@@ -154,13 +164,15 @@ def draw_success_by_measures(found: QualityTable, measures: Mapping[str, str], f
         _style_axes(axes)
         _draw_success_by_measure(axes, found, measure, label)
     handles, texts = figure.axes[0].get_legend_handles_labels()
-    columns = min(6, len(texts))
+    longest = max((len(line) for text in texts for line in text.split("\n")), default=0)
+    columns = max(1, min(6, len(texts), LEGEND_WIDTH * len(measures) // (longest + 6)))
     figure.legend(handles, texts, frameon=False, labelcolor=INK, fontsize=9, ncols=columns, loc="outside upper left")
     return _draw_on_white(figure, form, "quality")
 
 
 def _draw_success_by_measure(axes: Axes, found: QualityTable, measure: str, label: str) -> None:
-    colors = arm_colors([line.arm for line in found.arms])
+    arms = [line.arm for line in found.arms]
+    colors, markers = arm_colors(arms), arm_markers(arms)
     for line in found.arms:
         success, color, value = line.success, colors[line.arm], line.scores.get(measure)
         if value is None:
@@ -168,7 +180,7 @@ def _draw_success_by_measure(axes: Axes, found: QualityTable, measure: str, labe
         axes.plot([value.value] * 2, [success.low, success.high], color=color, lw=4, alpha=0.35, solid_capstyle="round")
         if not math.isnan(value.low):
             axes.plot([value.low, value.high], [success.value] * 2, color=color, lw=1.2, alpha=0.6)
-        axes.plot(value.value, success.value, "o", color=color, ms=9, label=_label(line.arm))
+        axes.plot(value.value, success.value, markers[line.arm], color=color, ms=9, label=_label(line.arm))
     axes.set_ylim(-3, 103)
     axes.xaxis.set_major_locator(MaxNLocator(TICKS))
     axes.set_xlabel(label)

@@ -17,7 +17,15 @@ from wiw.report.episodes import read_stories
 from wiw.report.maps import frame_of_picture, frame_of_points, start_and_goal, trail
 from wiw.report.page import SCALES, _gather_findings, _render_page, render, sentence
 from wiw.report.plans import format_glyphs
-from wiw.report.plots import BLAME_COLORS, _choose_text_color, success_by_arm, success_by_distance
+from wiw.report.plots import (
+    BLAME_COLORS,
+    PALETTE,
+    _choose_text_color,
+    arm_colors,
+    arm_markers,
+    success_by_arm,
+    success_by_distance,
+)
 from wiw.report.story import Album
 from wiw.report.templating import environment
 from wiw.runs.pictures import choose_pictured_episodes
@@ -256,6 +264,13 @@ def test_rates_by_distance_have_intervals_over_scenes(monkeypatch):
     ((rate,), ((below,), (above,))) = drawn[0]
     low, high = wilson(0.5, 40)
     assert rate == 50 and below > 1.5 * (50 - 100 * low) and above > 1.5 * (100 * high - 50)
+
+
+def test_arms_of_one_colour_have_different_markers():
+    arms = ["none", "oracle", *(f"arm {number}" for number in range(3 * len(PALETTE)))]
+    colors, markers = arm_colors(arms), arm_markers(arms)
+    assert len({(colors[arm], markers[arm]) for arm in arms}) == len(arms)
+    assert markers["arm 0"] == markers["oracle"] == "o"
 
 
 def test_plots_of_many_arms_have_room_for_their_names():
