@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import hmac
 import json
+import socket
 import threading
 import time
 from collections.abc import Mapping
@@ -20,6 +21,7 @@ from wiw.errors import ArgumentError, Error
 from wiw.vlm.base import Client
 from wiw.vlm.images import from_data_uri
 from wiw.vlm.messages import Call, Completion, Message, Part
+from wiw.vlm.mock import MockClient
 from wiw.wire.loopback import is_loopback
 
 MOST_BYTES = 256 << 20
@@ -37,6 +39,10 @@ class Response:
     status: int
     body: Mapping[str, Any]
     headers: Mapping[str, str] = field(default_factory=dict)
+
+
+class ClientGoneError(Exception):
+    """The client of a request has hung up: nobody would read the answer."""
 
 
 class VlmServer:
@@ -62,6 +68,8 @@ class VlmServer:
         self.requests: list[dict[str, Any]] = []
         """Bodies of the latest 1000 requests, without their images' data."""
         self.count = 0
+        self.serving = threading.local()
+        """Its `connection` is the socket of the request that this thread serves."""
         self._asking, self._counting = threading.Lock(), threading.Lock()
         try:
             self._http = _Http((host, port), _Handler)
@@ -81,7 +89,9 @@ class VlmServer:
         return self
 
     def serve(self) -> None:
-        """Serve until it is interrupted."""
+        """Serve until it is interrupted; a mock records no calls meanwhile, whose images would fill the memory."""
+        if isinstance(self.client, MockClient):
+            self.client.record = False
         self._http.serve_forever()
 
     def stop(self) -> None:
@@ -104,9 +114,15 @@ class VlmServer:
         return Response(200, make_chat_completion(self.complete(body), self.client.model, number))
 
     def complete(self, body: dict[str, Any]) -> Completion:
-        """Return the completion of a request."""
+        """Return the completion of a request.
+
+        Raises:
+            ClientGoneError: the client hung up while others had their turn.
+        """
         call = parse_call(body)
         with self._asking:
+            if _has_hung_up(getattr(self.serving, "connection", None)):
+                raise ClientGoneError
             (completion,) = self.client.complete([call])
         return completion
 
@@ -168,8 +184,11 @@ class _Handler(BaseHTTPRequestHandler):
             return
         try:
             body = json.loads(data)
+            server.serving.connection = self.connection
             response = server.respond(body, server.count_request(body))
             self._send(response.status, response.body, response.headers)
+        except ClientGoneError:
+            self.close_connection = True
         except Exception as error:
             self._send(400 if isinstance(error, UNCLEAR) else 500, _error(f"{type(error).__name__}: {error}"))
 
@@ -194,6 +213,22 @@ class _Handler(BaseHTTPRequestHandler):
             self.wfile.write(data)
         except (BrokenPipeError, ConnectionResetError, TimeoutError):  # the client has had enough
             self.close_connection = True
+
+
+def _has_hung_up(connection: socket.socket | None) -> bool:
+    """Return whether the other end of a connection is closed; False where there is none to look at."""
+    if connection is None:
+        return False
+    patience = connection.gettimeout()
+    connection.settimeout(0)  # with any other, Python waits for data, whatever the flags
+    try:
+        return not connection.recv(1, socket.MSG_PEEK | socket.MSG_DONTWAIT)
+    except BlockingIOError:
+        return False
+    except OSError:
+        return True
+    finally:
+        connection.settimeout(patience)
 
 
 def parse_call(body: Mapping[str, Any]) -> Call:

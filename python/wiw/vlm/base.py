@@ -6,7 +6,7 @@ from __future__ import annotations
 import json
 from abc import ABC, abstractmethod
 from collections import Counter
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from hashlib import blake2b
 from typing import Any
 
@@ -79,18 +79,15 @@ class Client(ABC):
         """Ask all requests at once, and repeat those that need it, until each has its reply.
 
         Raises:
-            VlmError: see `complete`; nothing is answered then. An unusable answer is not an error: it is in the reply.
+            VlmError: see `complete`; nothing is answered then, but completions that arrived are in the cache. An
+                unusable answer is not an error: it is in the reply.
         """
         talks = [Conversation(request, self.top_logprobs, self.votes) for request in requests]
         try:
             while waiting := [talk for talk in talks if talk.calls]:
-                calls = [call for talk in waiting for call in talk.calls]
-                names = [self.name_of(call) for call in calls]
-                answers = iter(zip(names, self._complete(calls, names), strict=True))
-                for talk in waiting:
-                    talk.receive([next(answers) for _ in talk.calls])
+                self._continue(waiting)
         finally:
-            self._keep([talk.reply for talk in talks])
+            self._keep(talks)
         return [talk.reply for talk in talks]
 
     def name_of(self, call: Call) -> str:
@@ -108,15 +105,40 @@ class Client(ABC):
                     digest.update(np.ascontiguousarray(part).data)
         return digest.hexdigest()
 
-    def _complete(self, calls: Sequence[Call], names: Sequence[str]) -> list[Completion]:
+    def iterate_completions(self, calls: Sequence[Call]) -> Iterator[tuple[int, Completion]]:
+        """Yield the place of each call with its completion, in any order.
+
+        Raises:
+            VlmError: see `complete`; after all completions that arrived.
+        """
+        yield from enumerate(self.complete(calls))
+
+    def _continue(self, talks: Sequence[Conversation]) -> None:
+        """Complete the calls of conversations and pass them the answers: where some fail, those that arrived."""
+        calls = [call for talk in talks for call in talk.calls]
+        names = [self.name_of(call) for call in calls]
         found = [None if self.cache is None else self.cache.get(self._make_cache_name(name)) for name in names]
+        try:
+            self._complete_missing(calls, found)
+        finally:
+            answers = iter(zip(names, found, strict=True))
+            for talk in talks:
+                talk.receive([next(answers) for _ in talk.calls])
+
+    def _complete_missing(self, calls: Sequence[Call], found: list[Completion | None]) -> None:
+        """Put the completions of calls that have none in their places, and count all."""
         missing = [place for place, completion in enumerate(found) if completion is None]
-        fresh = self.complete([calls[place] for place in missing]) if missing else []
-        for place, completion in zip(missing, fresh, strict=True):
-            found[place] = completion
-            self._count(completion)
         self.spent["vlm_cached"] += len(calls) - len(missing)
-        return [completion for completion in found if completion is not None]
+        if not missing:
+            return
+        try:
+            for place, completion in self.iterate_completions([calls[place] for place in missing]):
+                found[missing[place]] = completion
+        finally:
+            for place in missing:  # in order, so that the sum of dollars is the same every time
+                completion_of_place = found[place]
+                if completion_of_place is not None:
+                    self._count(completion_of_place)
 
     def _count(self, completion: Completion) -> None:
         tokens = completion.prompt_tokens, completion.completion_tokens
@@ -126,11 +148,11 @@ class Client(ABC):
         if usd is not None:
             self.spent["vlm_usd"] += usd  # type: ignore[assignment]  # money comes in fractions
 
-    def _keep(self, replies: Sequence[Reply]) -> None:
-        """Cache the answers that were used; unusable ones are requested again next time."""
+    def _keep(self, talks: Sequence[Conversation]) -> None:
+        """Cache the answers of use; unusable ones are requested again next time."""
         if self.cache is not None:
-            used = [each for reply in replies for each in reply.completions if each.used]
-            self.cache.put({self._make_cache_name(each.call): each.completion for each in used})
+            useful = [answer for talk in talks for answer in talk.list_useful()]
+            self.cache.put({self._make_cache_name(name): completion for name, completion in useful})
 
     def _make_cache_name(self, name: str) -> str:
         return f"{self.manner} {name}"

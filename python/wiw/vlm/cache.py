@@ -25,6 +25,8 @@ from wiw.vlm.messages import Completion
 _log = logging.getLogger("wiw.vlm")
 BUDGET_GB = 1.0
 """Default limit of the cache in gigabytes; an answer takes about a kilobyte."""
+LONGEST_WAIT = 30.0
+"""Seconds to wait while another process writes."""
 _SCHEMA = "CREATE TABLE IF NOT EXISTS reply (name TEXT PRIMARY KEY, data TEXT NOT NULL, used REAL NOT NULL)"
 
 
@@ -68,10 +70,10 @@ class ReplyCache:
                 row = connection.execute("SELECT data FROM reply WHERE name = ?", (name,)).fetchone()
                 if row is None:
                     return None
-                connection.execute("UPDATE reply SET used = ? WHERE name = ?", (time.time(), name))
+                self._mark_used(connection, name)
             return Completion.from_json(json.loads(row[0]))
         except (sqlite3.Error, OSError) as error:
-            self._disable(error)
+            self._handle(error)
         except (ValueError, KeyError, TypeError) as error:
             _log.warning("cached answer %s is damaged (%s); it is requested again", name, error)
         return None
@@ -87,11 +89,19 @@ class ReplyCache:
                 connection.executemany("INSERT OR REPLACE INTO reply VALUES (?, ?, ?)", rows)
                 self._trim(connection)
         except (sqlite3.Error, OSError) as error:
-            self._disable(error)
+            self._handle(error)
+
+    def _mark_used(self, connection: sqlite3.Connection, name: str) -> None:
+        """Note when an answer was used; not while another process writes for long: the answer is there all the same."""
+        try:
+            connection.execute("UPDATE reply SET used = ? WHERE name = ?", (time.time(), name))
+        except sqlite3.OperationalError as error:
+            if not _is_locked(error):
+                raise
 
     def _open(self) -> sqlite3.Connection:
         if self._connection is None or self._process != os.getpid():
-            connection = sqlite3.connect(self.folder / "replies.sqlite", timeout=30, check_same_thread=False)
+            connection = sqlite3.connect(self.folder / "replies.sqlite", timeout=LONGEST_WAIT, check_same_thread=False)
             connection.execute(f"PRAGMA journal_mode = {choose_journal_mode(self.folder)}")
             connection.execute("PRAGMA synchronous = NORMAL")
             connection.execute(_SCHEMA)
@@ -99,17 +109,33 @@ class ReplyCache:
         return self._connection
 
     def _trim(self, connection: sqlite3.Connection) -> None:
-        """Reduce the cache to nine tenths of its budget where it has outgrown it."""
+        """Reduce the cache to nine tenths of its budget where its pages have outgrown it.
+
+        Pages are counted at once; the lengths of all answers, only where some are to be deleted.
+        """
         budget = self.budget_gb * 2**30
-        total = connection.execute("SELECT total(length(data)) FROM reply").fetchone()[0]
-        if total <= budget:
+        size, pages, free = (
+            connection.execute(f"PRAGMA {name}").fetchone()[0] for name in ("page_size", "page_count", "freelist_count")
+        )
+        occupied = size * (pages - free)
+        if occupied <= budget:
             return
+        total = connection.execute("SELECT total(length(data)) FROM reply").fetchone()[0]
         connection.execute(
             "DELETE FROM reply WHERE name IN (SELECT name FROM (SELECT name, length(data) AS own,"
             " sum(length(data)) OVER (ORDER BY used, name) AS freed FROM reply) WHERE freed - own < ?)",
-            (total - 0.9 * budget,),
+            (total * (1 - 0.9 * budget / occupied),),
         )
 
-    def _disable(self, error: Exception) -> None:
+    def _handle(self, error: Exception) -> None:
+        """Log why the cache was not reached, and use it no more unless that passes."""
+        if _is_locked(error):
+            _log.warning("%s: not reached for one answer: another process wrote there for long", self.folder)
+            return
         self._broken = True
         _log.warning("answers are no longer cached: %s; free some disk space or choose another folder", error)
+
+
+def _is_locked(error: Exception) -> bool:
+    """Return whether another connection held SQLite's lock for longer than this one waits."""
+    return isinstance(error, sqlite3.OperationalError) and "locked" in str(error)

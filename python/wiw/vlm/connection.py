@@ -4,6 +4,7 @@
 from __future__ import annotations
 
 import inspect
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -49,5 +50,5 @@ def _factory(spec: str) -> tuple[Any, tuple[str, ...]]:
     if spec == "mock":
         from wiw.vlm.mock import MockClient
 
-        return MockClient, ()
+        return partial(MockClient, record=False), ()
     raise ArgumentError(f"vlm: expected http://HOST:PORT/v1, transformers:PATH, replay:RUN or mock, got '{spec}'")

@@ -25,15 +25,19 @@ class Conversation:
 
     def __init__(self, request: Request, top_logprobs: int, votes: int) -> None:
         self._talk = _ask_for_choice(request, top_logprobs, votes) if request.choices else _ask_for_text(request)
+        self._is_choice = bool(request.choices)
         self._said: list[tuple[str, Completion]] = []
         self.calls: list[Call] = next(self._talk)
         self.reply = Reply()
 
-    def receive(self, answers: Sequence[tuple[str, Completion]]) -> None:
-        """Take (name, completion) for each of the calls."""
-        self._said += answers
+    def receive(self, answers: Sequence[tuple[str, Completion | None]]) -> None:
+        """Take (name, completion) for each of the calls; where one failed (None), the conversation does not go on."""
+        arrived = [(name, completion) for name, completion in answers if completion is not None]
+        self._said += arrived
+        if len(arrived) < len(answers):
+            return
         try:
-            self.calls = self._talk.send([completion for _, completion in answers])
+            self.calls = self._talk.send([completion for _, completion in arrived])
         except StopIteration as end:
             reply: Reply = end.value
             latest = len(self._said) - len(answers)
@@ -42,6 +46,12 @@ class Conversation:
                 for place, (name, completion) in enumerate(self._said)
             )
             self.calls, self.reply = [], replace(reply, completions=records)
+
+    def list_useful(self) -> list[tuple[str, Completion]]:
+        """Return (name, completion) of the answers that were used; of a choice that did not end, the usable ones."""
+        if not self.calls:
+            return [(each.call, each.completion) for each in self.reply.completions if each.used]
+        return [each for each in self._said if self._is_choice and structured.find_problem(each[1]) is None]
 
 
 def _ask_for_text(request: Request) -> Talk:

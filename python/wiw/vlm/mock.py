@@ -13,6 +13,8 @@ from wiw.vlm.instances import generate_instance
 from wiw.vlm.messages import Call, Completion
 
 Script = Callable[[Call], "str | Mapping[str, float] | Completion"]
+PHRASES = ("the way ahead is clear", "something is in the way", "it is on the left", "it is on the right")
+"""Free strings of objects."""
 WORDS = ("a", "door", "is", "ahead", "on", "the", "left", "right", "and", "clear")
 
 
@@ -22,14 +24,17 @@ class MockClient(Client):
     Args:
         script: returns the answer to a call: text, a probability for each first token, or a whole completion.
         model: its name.
+        record: whether `calls` keeps every call, with its images, for tests that look at them.
         options: see `Client`.
     """
 
-    def __init__(self, script: Script | None = None, model: str = "mock", **options: Any) -> None:
+    def __init__(
+        self, script: Script | None = None, model: str = "mock", *, record: bool = True, **options: Any
+    ) -> None:
         super().__init__(**options)
-        self.script, self._model = script, model
+        self.script, self._model, self.record = script, model, record
         self.calls: list[Call] = []
-        """All calls so far."""
+        """All calls so far; none where they are not recorded."""
 
     @property
     def model(self) -> str:
@@ -38,7 +43,8 @@ class MockClient(Client):
 
     def complete(self, calls: Sequence[Call]) -> list[Completion]:
         """Return the script's answers, or random ones."""
-        self.calls += calls
+        if self.record:
+            self.calls += calls
         return [to_completion(self._draw(call) if self.script is None else self.script(call), call) for call in calls]
 
     def _draw(self, call: Call) -> str | dict[str, float]:
@@ -47,7 +53,11 @@ class MockClient(Client):
             labels = call.labels or ("A", "B")  # what is asked about letters without naming them has two at least
             return dict(zip(labels, random.dirichlet(np.ones(len(labels))).tolist(), strict=True))
         if call.schema is not None:
-            return generate_instance(call.schema, lambda _, options: int(random.integers(len(options))))
+            return generate_instance(
+                call.schema,
+                lambda _, options: int(random.integers(len(options))),
+                lambda _, least, most: PHRASES[int(random.integers(len(PHRASES)))].ljust(least, ".")[:most],
+            )
         return " ".join(WORDS[k] for k in random.integers(len(WORDS), size=6))
 
 

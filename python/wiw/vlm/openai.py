@@ -7,8 +7,8 @@ import email.utils
 import json
 import random
 import time
-from collections.abc import Callable, Iterator, Sequence
-from concurrent.futures import Future, ThreadPoolExecutor, wait
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from concurrent.futures import FIRST_COMPLETED, CancelledError, Future, ThreadPoolExecutor, as_completed, wait
 from dataclasses import dataclass, replace
 from functools import cached_property
 from importlib import import_module
@@ -114,22 +114,34 @@ class OpenAIClient(Client):
 
     def complete(self, calls: Sequence[Call]) -> list[Completion]:
         """All calls, at most `concurrency` at a time."""
+        found = dict(self.iterate_completions(calls))
+        return [found[place] for place in range(len(calls))]
+
+    def iterate_completions(self, calls: Sequence[Call]) -> Iterator[tuple[int, Completion]]:
+        """Yield the place of each call with its completion, as they arrive.
+
+        After an error, requests that were not sent are dropped, and those in flight are waited for: they have their
+        price, too. After an interruption, such as Ctrl-C, nothing is waited for or sent again.
+        """
+        bodies = self._make_bodies(calls)
+        stopped: Future[None] = Future()
+        pool = ThreadPoolExecutor(min(self.concurrency, len(bodies)))
+        try:
+            sent = {pool.submit(self._request_completion, body, stopped): place for place, body in enumerate(bodies)}
+            yield from _iterate_results(sent)
+        finally:
+            stopped.set_result(None)
+            pool.shutdown(wait=False, cancel_futures=True)
+
+    def _make_bodies(self, calls: Sequence[Call]) -> list[dict[str, Any]]:
+        """Return the bodies of requests; an image that several calls show is encoded once."""
         images: dict[int, str] = {}
         for call in calls:
             for message in call.messages:
                 for part in message.content:
                     if not isinstance(part, str) and id(part) not in images:
                         images[id(part)] = to_data_uri(part, self.image_format)
-        bodies = [self._body(call, images) for call in calls]
-        with ThreadPoolExecutor(min(self.concurrency, len(bodies))) as pool:
-            sent = [pool.submit(self._request_completion, body) for body in bodies]
-            try:
-                return [each.result() for each in sent]
-            except BaseException:
-                for each in wait([each for each in sent if not each.cancel()]).done:
-                    if each.exception() is None:  # it has its price, too
-                        self._count(each.result())
-                raise
+        return [self._body(call, images) for call in calls]
 
     @cached_property
     def _sdk(self) -> Any:
@@ -171,9 +183,9 @@ class OpenAIClient(Client):
             body["response_format"] = {"type": "json_schema", "json_schema": schema}
         return {**body, "extra_body": extra} if extra else body
 
-    def _request_completion(self, body: dict[str, Any]) -> Completion:
+    def _request_completion(self, body: dict[str, Any], stopped: Future[None]) -> Completion:
         retries = _Retries()
-        completion = self._ask_with_retries(lambda: self._receive_completion(body), retries)
+        completion = self._ask_with_retries(lambda: self._receive_completion(body), retries, stopped)
         return replace(completion, retries=retries.count)
 
     def _receive_completion(self, body: dict[str, Any]) -> Completion:
@@ -189,54 +201,77 @@ class OpenAIClient(Client):
                     raise TimeoutError(f"the reply was not complete within {self.timeout:g} s")
         return _completion(bytes(data))
 
-    def _ask_with_retries(self, work: Any, retries: _Retries | None = None) -> Any:
-        """Call the server, with retries for errors that may pass.
+    def _ask_with_retries(self, work: Any, retries: _Retries | None = None, stopped: Future[None] | None = None) -> Any:
+        """Call the server, with retries for errors that may pass, until it is stopped.
 
         Raises:
             VlmError: all `attempts` failed, or the server refused the request.
+            CancelledError: it was stopped.
         """
         import openai
 
-        retries = retries or _Retries()
+        retries, stopped = retries or _Retries(), stopped or Future()
         while True:
             try:
-                return _run_within(self.timeout, work)
+                return _run_within(self.timeout, work, stopped)
             except openai.APIStatusError as error:
                 passing = error.status_code in _PASSING or error.status_code >= 500
-                said, kind, wait = (
+                said, kind, pause = (
                     f"{error.status_code} {_shorten(error)}",
                     "status" if passing else "refused",
                     _read_retry_after(error),
                 )
             except (openai.APITimeoutError, TimeoutError) as error:
-                passing, said, kind, wait = (
+                passing, said, kind, pause = (
                     True,
                     _shorten(error) or f"no answer within {self.timeout:g} s",
                     "timeout",
                     None,
                 )
             except _NoCompletionError as error:
-                passing, said, kind, wait = True, _shorten(error), "protocol", None
+                passing, said, kind, pause = True, _shorten(error), "protocol", None
             except _BrokenOffError as error:
-                passing, said, kind, wait = True, _shorten(error), "unreachable", None
+                passing, said, kind, pause = True, _shorten(error), "unreachable", None
             except openai.APIError as error:
-                passing, said, kind, wait = True, f"{type(error).__name__}: {_shorten(error)}", "unreachable", None
+                passing, said, kind, pause = True, f"{type(error).__name__}: {_shorten(error)}", "unreachable", None
             if not passing or retries.count + 1 >= self.attempts:
                 times = f"{retries.count + 1} tries" if retries.count else "1 try"
                 hint = REFUSED_LOGPROBS if kind == "refused" and "logprob" in said else ""
                 hint = NOBODY_THERE if said.startswith("APIConnectionError") else hint
                 raise VlmError(f"{self.base_url}: {said} ({times}){hint}", kind)
-            time.sleep(min(LONGEST_WAIT, retries.pause() if wait is None else wait))
+            if wait([stopped], min(LONGEST_WAIT, retries.pause() if pause is None else pause)).done:
+                raise CancelledError
             retries.count += 1
 
 
-def _run_within(seconds: float, work: Callable[[], Any]) -> Any:
-    """Do the work in a separate thread, which is abandoned after `seconds`.
+def _iterate_results(sent: Mapping[Future[Completion], int]) -> Iterator[tuple[int, Completion]]:
+    """Yield the place and result of each piece of work as it ends; after an error, of those that have begun.
+
+    Raises the first error at the end.
+    """
+    failure: BaseException | None = None
+    for each in as_completed(sent):
+        if each.cancelled():
+            continue
+        error = each.exception()
+        if error is None:
+            yield sent[each], each.result()
+        elif failure is None:
+            failure = error
+            for other in sent:
+                other.cancel()
+    if failure is not None:
+        raise failure
+
+
+def _run_within(seconds: float, work: Callable[[], Any], stopped: Future[None]) -> Any:
+    """Do the work in a separate thread, which is abandoned after `seconds`, or once it is stopped.
 
     The transport limits each read but not their sum, so headers that drip in would take any time.
 
     Raises:
         TimeoutError: it took longer; and whatever the work raises.
+        CancelledError: it was stopped.
     """
     outcome: Future[Any] = Future()
 
@@ -247,7 +282,9 @@ def _run_within(seconds: float, work: Callable[[], Any]) -> Any:
             outcome.set_exception(error)
 
     Thread(target=run, daemon=True, name="wiw vlm request").start()
-    if not wait([outcome], seconds).done:
+    if stopped in wait([outcome, stopped], seconds, FIRST_COMPLETED).done:
+        raise CancelledError
+    if not outcome.done():
         raise TimeoutError(f"the reply was not complete within {seconds:g} s")
     return outcome.result()
 

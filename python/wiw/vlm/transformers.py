@@ -3,6 +3,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from functools import cached_property
 from hashlib import blake2b
@@ -14,18 +15,23 @@ from wiw.errors import DependencyError, WeightsError
 from wiw.vlm.base import Client
 from wiw.vlm.choices import LETTER_CONTEXT
 from wiw.vlm.instances import generate_instance
+from wiw.vlm.json_strings import read_string
 from wiw.vlm.messages import Call, Completion, Message
 from wiw.vlm.tiny import MISSING_PACKAGES
 
 MAX_FIRST_TOKENS = 256
 """Number of likeliest first tokens that are considered."""
+GENERATION_VERSION = 2
+"""Version of how text and objects are generated; part of the names of cached answers."""
+BYTES_OF_A_CHARACTER = 4
+"""Most tokens that one character may take, in a tokenizer that falls back on bytes."""
 
 
 class TransformersClient(Client):
     """Queries a local image-text-to-text model, one request after the other.
 
     Multiple choice reads the scores of the first token. Objects that match a schema are built by letting the model
-    choose between the schema's continuations, so that they are always well-formed.
+    choose between the schema's continuations and write the free strings, so that they are always well-formed.
 
     Args:
         path: a folder or hub name that `AutoModelForImageTextToText.from_pretrained` takes.
@@ -69,14 +75,16 @@ class TransformersClient(Client):
 
     @cached_property
     def manner(self) -> str:
-        """Digest of the weights, and the device: folders of one name may hold different weights."""
+        """The version of the generation, a digest of the weights, which differ between folders of one name, and the
+        device.
+        """
         import torch
 
         digest = blake2b(str(getattr(self._processor, "chat_template", "")).encode(), digest_size=16)
         for name, values in sorted(self._network.state_dict().items()):
             digest.update(f"{name} {values.dtype} {tuple(values.shape)}".encode())
             digest.update(values.detach().cpu().contiguous().reshape(-1).view(torch.uint8).numpy().data)
-        return f"{digest.hexdigest()} {torch.device(self.device).type}"
+        return f"{GENERATION_VERSION} {digest.hexdigest()} {torch.device(self.device).type}"
 
     def complete(self, calls: Sequence[Call]) -> list[Completion]:
         """Complete the calls one after the other."""
@@ -94,10 +102,10 @@ class TransformersClient(Client):
             ]
             return Completion(listed[0][0], "length", tuple(tokens_listed), read, 1)
         if call.schema is not None:
-            text = self._generate_object(call)
-            return Completion(text, "stop", None, read, self._count_tokens(text))
-        tokens = self._generate_tokens(inputs, call)
-        text = self._tokenizer.decode(tokens, skip_special_tokens=True)
+            text, whole = _ObjectWriter(self, call).generate()
+            return Completion(text, "stop" if whole else "length", None, read, self._count_tokens(text))
+        tokens = self._generate_tokens(inputs, call, call.max_tokens, call.seed)
+        text = self._decode(tokens)
         finish = "stop" if len(tokens) and tokens[-1] == self._tokenizer.eos_token_id else "length"
         return Completion(text, finish, None, read, len(tokens))
 
@@ -137,33 +145,32 @@ class TransformersClient(Client):
             (self._tokenizer.decode([token]), value) for token, value in zip(ids.tolist(), values.tolist(), strict=True)
         ]
 
-    def _generate_tokens(self, inputs: Any, call: Call) -> list[int]:
+    def _generate_tokens(self, inputs: Any, call: Call, most: int, seed: int, **options: Any) -> list[int]:
+        """Generate up to `most` tokens, sampled from all of the vocabulary unless the temperature is 0."""
         import torch
 
-        sampling = (
-            {"do_sample": True, "temperature": call.temperature} if call.temperature > 0 else {"do_sample": False}
-        )
+        sampling: dict[str, Any] = {"do_sample": False}
+        if call.temperature > 0:  # what the model's own settings say of top_k and top_p, the request does not ask for
+            sampling = {"do_sample": True, "temperature": call.temperature, "top_k": 0, "top_p": 1.0}
         with torch.inference_mode(), torch.random.fork_rng():
-            torch.manual_seed(call.seed)
-            whole = self._network.generate(**inputs, max_new_tokens=call.max_tokens, **sampling)
+            torch.manual_seed(seed)
+            whole = self._network.generate(**inputs, max_new_tokens=most, **sampling, **options)
         return list(whole[0, inputs["input_ids"].shape[1] :].tolist())
 
-    def _generate_object(self, call: Call) -> str:
-        """Generate an object that matches the schema; each choice is sampled by the model's probabilities."""
-        import torch
+    def _decode(self, tokens: Any) -> str:
+        return str(self._tokenizer.decode(tokens, skip_special_tokens=True, clean_up_tokenization_spaces=False))
 
-        assert call.schema is not None
-        random = torch.Generator().manual_seed(call.seed)
+    @cached_property
+    def _unwritten_tokens(self) -> list[int]:
+        """Special tokens that are no part of a text and do not end one, such as an image's."""
+        ends = self._network.generation_config.eos_token_id
+        return sorted({*self._tokenizer.all_special_ids} - {*(ends if isinstance(ends, list) else [ends])})
 
-        def choose(before: str, options: Sequence[str]) -> int:
-            if len(options) == 1:
-                return 0
-            scores = self._compute_logprobs(call.messages, before, options)
-            if call.temperature == 0:
-                return int(scores.argmax())
-            return int(torch.multinomial(torch.softmax(scores / call.temperature, -1), 1, generator=random))
-
-        return generate_instance(call.schema, choose)
+    @cached_property
+    def _closing_tokens(self) -> list[int]:
+        """Tokens that may end a string: those with a quote, and the special ones."""
+        quoting = (token for piece, token in self._tokenizer.get_vocab().items() if '"' in piece)
+        return sorted({*quoting, *self._tokenizer.all_special_ids})
 
     def _compute_logprobs(self, messages: Sequence[Message], before: str, options: Sequence[str]) -> Any:
         """Return the log-probability of each text after `before`, given that the model writes one of them."""
@@ -180,6 +187,66 @@ class TransformersClient(Client):
                     logprobs = self._network(**way).logits[0, begin - 1 :].float().log_softmax(-1).cpu()
             chances.append(_compute_logprob(logprobs if goes_on else logprobs[:1], own, tokens, begin))
         return torch.tensor(chances)
+
+
+class _ObjectWriter:
+    """Lets a model generate one object that matches the call's schema, by its probabilities at the temperature."""
+
+    def __init__(self, client: TransformersClient, call: Call) -> None:
+        import torch
+
+        self.client, self.call, self.whole = client, call, True
+        self.random = torch.Generator().manual_seed(call.seed)
+
+    def generate(self) -> tuple[str, bool]:
+        """Return the object's text, and whether no string was cut off because of the call's limit on tokens."""
+        assert self.call.schema is not None
+        return generate_instance(self.call.schema, self.choose, self.write), self.whole
+
+    def choose(self, before: str, options: Sequence[Sequence[str]]) -> int:
+        """Return the index of an option; its probability is that of all its texts together."""
+        import torch
+
+        if len(options) == 1:
+            return 0
+        texts = list(dict.fromkeys(text for option in options for text in option))
+        logprobs = self.client._compute_logprobs(self.call.messages, before, texts)
+        scores = torch.stack([logprobs[[texts.index(text) for text in option]].logsumexp(0) for option in options])
+        if self.call.temperature == 0:
+            return int(scores.argmax())
+        return int(torch.multinomial(torch.softmax(scores / self.call.temperature, -1), 1, generator=self.random))
+
+    def write(self, before: str, least: int, most: int | None) -> str:
+        """Return a string that the model writes up to its closing quote, at most half of the tokens that are left: the
+        names and values that follow need some, too.
+        """
+        client, left = self.client, self.call.max_tokens - self.client._count_tokens(before)
+        limit = max(1, left // 2, BYTES_OF_A_CHARACTER * least)
+        inputs = client._prepare_inputs(self.call.messages, before + '"')
+        begin = int(inputs["input_ids"].shape[1])
+
+        def has_ended(tokens: Any, _: Any, **__: Any) -> Any:
+            text, closed = read_string(client._decode(tokens[0, begin:]))
+            return tokens.new_full((1,), closed or (most is not None and len(text) >= most), dtype=bool)
+
+        def keep_open(tokens: Any, scores: Any) -> Any:
+            if len(read_string(client._decode(tokens[0, begin:]))[0]) < least:
+                scores[:, client._closing_tokens] = -math.inf
+            return scores
+
+        options = {"stopping_criteria": [has_ended], "logits_processor": [keep_open] if least else []}
+        options["suppress_tokens"] = client._unwritten_tokens
+        tokens = client._generate_tokens(inputs, self.call, limit, self._draw_seed(), **options)
+        text, closed = read_string(client._decode(tokens))
+        full = most is not None and len(text) >= most
+        self.whole &= closed or full or len(tokens) < limit
+        return text[:most]
+
+    def _draw_seed(self) -> int:
+        """Draw a seed for one string: strings of one object differ, and the order of calls does not count."""
+        import torch
+
+        return int(torch.randint(2**31, (1,), generator=self.random))
 
 
 def _compute_logprob(logprobs: Any, own: list[int], tokens: Sequence[list[int]], begin: int) -> float:

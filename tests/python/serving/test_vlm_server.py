@@ -4,8 +4,12 @@
 from __future__ import annotations
 
 import json
+import os
 import pickle
+import signal
 import socket
+import subprocess
+import sys
 import threading
 import time
 from collections.abc import Iterator
@@ -292,6 +296,114 @@ def test_what_was_paid_for_is_counted_though_another_question_fails(tmp_path: Pa
         with pytest.raises(VlmError, match="never"):
             client.ask([Request((user("Say"),)), Request((user("Bad"),))])
         assert client.spent["vlm_calls"] == 1 and client.spent["vlm_input_tokens"] > 0
+
+
+@pytest.mark.parametrize("concurrency", [1, 3])
+def test_what_was_paid_for_is_not_asked_again_though_another_question_fails(tmp_path: Path, concurrency: int) -> None:
+    """Of choices in rounds and votes, too, where one question takes several calls."""
+    failing_now = True
+
+    def script(call: Any) -> Any:
+        if failing_now and call.labels == ("A", "B"):  # the final of the many choices
+            raise ValueError("never")
+        return {"A": 0.75, "B": 0.25} if call.labels else "fine"
+
+    many = tuple(f"o{k}" for k in range(6))
+    requests = [Request((user("Which?", IMAGE),), choices=many), *(Request((user(f"Say {k}"),)) for k in range(3))]
+    with VlmServer(MockClient(script)) as server:
+        options = {"dialect": "vllm", "top_logprobs": 3, "concurrency": concurrency, "attempts": 1}
+        with pytest.raises(VlmError, match="never"):
+            connect(server.url, cache=ReplyCache(tmp_path), **options).ask(requests)
+        assert server.count == 6
+        failing_now = False
+        replies = connect(server.url, cache=ReplyCache(tmp_path), **options).ask(requests)
+        assert server.count == 7 and all(reply.problem is None for reply in replies)
+
+
+def test_answers_that_arrived_beside_a_failure_are_kept(tmp_path: Path) -> None:
+    arrived = threading.Event()
+
+    def script(call: Any) -> str:
+        if parts_of(call)[0] == "Bad":
+            raise ValueError("never")
+        arrived.set()
+        return "fine"
+
+    with VlmServer(MockClient(script)) as server:
+        requests = [Request((user("Bad"),)), Request((user("Say"),))]
+        with pytest.raises(VlmError, match="never"):
+            connect(server.url, concurrency=2, attempts=1, cache=ReplyCache(tmp_path)).ask(requests)
+        assert arrived.is_set()
+        again = connect(server.url, cache=ReplyCache(tmp_path))
+        assert again.ask(requests[1:])[0].text == "fine" and again.spent["vlm_calls"] == 0
+
+
+@pytest.mark.parametrize("fault", ["slow", "429"])
+def test_an_interrupted_client_neither_waits_nor_asks_again(fault: str) -> None:
+    """Ctrl-C in a process that asks a server which is slow, or asks for a pause of half a minute."""
+    asking = (
+        "import sys; from wiw.vlm import Request, connect, user\n"
+        "client = connect(sys.argv[1], model='mock', concurrency=2)\n"
+        "client.ask([Request((user(f'Say {k}'),)) for k in range(6)])\n"
+    )
+    faults = Misbehaviour({fault: 1.0}, slow_seconds=30.0, retry_after=30.0)
+    with MisbehavingVlmServer(MockClient(), misbehaviour=faults) as server:
+        environment = {**os.environ, "PYTHONPATH": os.pathsep.join(sys.path)}
+        with subprocess.Popen(
+            [sys.executable, "-c", asking, server.url], env=environment, stderr=subprocess.PIPE, text=True
+        ) as process:
+            until = time.monotonic() + 120
+            while server.count < 2 and time.monotonic() < until:
+                time.sleep(0.05)
+            time.sleep(0.3)
+            begin = time.monotonic()
+            process.send_signal(signal.SIGINT)
+            try:
+                _, said = process.communicate(timeout=15)
+            finally:
+                process.kill()
+        assert "KeyboardInterrupt" in said and time.monotonic() - begin < 15 and server.count == 2
+
+
+def test_clients_that_hung_up_have_no_turn() -> None:
+    """A model that is slower than its clients' patience would else answer no one."""
+    begun, go_on = threading.Event(), threading.Event()
+
+    def script(call: Any) -> str:
+        begun.set()
+        go_on.wait(30)
+        return "fine"
+
+    client = MockClient(script)
+    with VlmServer(client) as server:
+        port = int(server.url.split(":")[2][:-3])
+
+        def send(text: str) -> HTTPConnection:
+            http = HTTPConnection("127.0.0.1", port, timeout=30)
+            http.request("POST", "/v1/chat/completions", json.dumps({"messages": [{"role": "user", "content": text}]}))
+            return http
+
+        first = send("first")
+        assert begun.wait(30)
+        impatient, patient = send("impatient"), send("patient")
+        until = time.monotonic() + 30
+        while server.count < 3 and time.monotonic() < until:
+            time.sleep(0.01)
+        impatient.close()
+        go_on.set()
+        for http in (first, patient):
+            assert http.getresponse().status == 200
+            http.close()
+        assert sorted(parts_of(call)[0] for call in client.calls) == ["first", "patient"]
+
+
+def test_a_mock_served_by_the_command_records_no_calls(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(vlm_server._Http, "serve_forever", lambda self: None)
+    server = VlmServer(MockClient(lambda call: "fine"))
+    server.serve()
+    server._http.server_close()
+    server.client.ask(REQUESTS[2:3])
+    assert server.client.calls == []
 
 
 def test_what_was_answered_before_a_failure_is_kept(tmp_path: Path) -> None:

@@ -7,8 +7,8 @@ import json
 import math
 import pickle
 import sqlite3
-from collections.abc import Iterator
 from concurrent.futures import ThreadPoolExecutor
+from contextlib import closing
 from pathlib import Path
 from typing import Any, Literal
 
@@ -224,14 +224,16 @@ def test_the_cache_answers_what_was_of_use(tmp_path: Path) -> None:
 
 
 def test_the_cache_keeps_to_its_budget_and_survives_damage(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
-    cache = ReplyCache(tmp_path, 20_000 / 2**30)
-    for k in range(60):
+    cache = ReplyCache(tmp_path, 200_000 / 2**30)
+    for k in range(200):
         cache.put({f"k{k}": Completion("x" * 1000)})
-    kept = [k for k in range(60) if cache.get(f"k{k}")]
-    assert kept == list(range(60 - len(kept), 60)) and 12 <= len(kept) <= 18
+    kept = [k for k in range(200) if cache.get(f"k{k}")]
+    assert kept == list(range(200 - len(kept), 200)) and 100 <= len(kept) <= 160
     with sqlite3.connect(tmp_path / "replies.sqlite") as connection:
-        connection.execute("UPDATE reply SET data = '{' WHERE name = 'k59'")
-    assert cache.get("k59") is None and "damaged" in caplog.text
+        (pages,) = connection.execute("PRAGMA page_count").fetchone()
+        assert pages * 4096 <= 200_000 + 2 * 4096
+        connection.execute("UPDATE reply SET data = '{' WHERE name = 'k199'")
+    assert cache.get("k199") is None and "damaged" in caplog.text
     (tmp_path / "broken").mkdir()
     (tmp_path / "broken/replies.sqlite").write_bytes(b"no database" * 100)
     broken = ReplyCache(tmp_path / "broken")
@@ -239,6 +241,43 @@ def test_the_cache_keeps_to_its_budget_and_survives_damage(tmp_path: Path, caplo
     broken.put({"a": Completion("x")})
     with pytest.raises(ArgumentError, match="above 0"):
         ReplyCache(tmp_path, 0)
+
+
+def test_answers_are_added_up_only_where_some_must_go(tmp_path: Path) -> None:
+    """Reading all of them for each new one would take longer and longer."""
+    cache = ReplyCache(tmp_path, 400_000 / 2**30)
+    asked: list[str] = []
+    cache._open().set_trace_callback(asked.append)
+    counts = []
+    for _ in range(3):
+        for k in range(200):
+            cache.put({f"{len(counts)} {k}": Completion("x" * 1000)})
+        counts.append(sum("total(" in each for each in asked))
+    assert counts[0] == 0 and 0 < counts[2] < 40
+
+
+def test_a_locked_cache_is_used_again_when_it_is_free(
+    tmp_path: Path, caplog: pytest.LogCaptureFixture, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("wiw.vlm.cache.LONGEST_WAIT", 0.1)
+    cache = ReplyCache(tmp_path)
+    cache.put({"old": Completion("x")})
+    with closing(sqlite3.connect(tmp_path / "replies.sqlite")) as other:
+        other.execute("BEGIN IMMEDIATE")
+        assert cache.get("old") == Completion("x")
+        assert not caplog.text
+        cache.put({"new": Completion("y")})
+    assert "another process wrote" in caplog.text and "disk space" not in caplog.text
+    assert cache.get("new") is None
+    cache.put({"new": Completion("y")})
+    assert cache.get("new") == Completion("y")
+
+
+def test_a_mock_records_calls_in_a_test_and_not_in_a_run() -> None:
+    scripted, random = MockClient(lambda call: "x"), connect("mock")
+    for client, count in ((scripted, 1), (MockClient(), 1), (MockClient(record=False), 0), (random, 0)):
+        ask(client, IMAGE)
+        assert len(client.calls) == count
 
 
 def test_the_cache_serves_several_threads(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
@@ -300,7 +339,10 @@ class Tree(pydantic.BaseModel):
 
 @given(st.randoms(use_true_random=False))
 def test_instances_fit_their_schema(random: Any) -> None:
-    text = generate_instance(Tree.model_json_schema(), lambda before, options: random.randrange(len(options)))
+    def choose(before: str, options: Any) -> int:
+        return int(random.randrange(len(options)))
+
+    text = generate_instance(Tree.model_json_schema(), choose, lambda before, least, most: '"\\\n"'[:most])
     Tree.model_validate(json.loads(text))
 
 
@@ -327,14 +369,6 @@ def test_a_recorded_answer_is_given_again_and_nothing_else(tmp_path: Path) -> No
         connect(f"replay:{run}", model="another")
     with pytest.raises(FileError, match="no run at"):
         connect(f"replay:{tmp_path / 'nowhere'}")
-
-
-@pytest.fixture(scope="module")
-def tiny(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Path]:
-    pytest.importorskip("transformers")
-    from wiw.vlm.tiny import make_tiny
-
-    yield make_tiny(tmp_path_factory.mktemp("vlm") / "tiny")
 
 
 def test_a_local_model_answers_by_the_scores_of_the_first_token(tiny: Path) -> None:
