@@ -115,8 +115,8 @@ class VectorEnv(gymnasium.vector.VectorEnv[dict[str, Any], NDArray[np.int64], ND
                 state.record_answer(self.task, answer, final=True)
             state.observed.append(len(state.positions) - 1)
             self._keys[place] = self._keys[place].at(self._keys[place].decision + 1)
-        for place, key in enumerate(self._keys):
-            self._add_info(infos, {"key": key}, place)
+        for number, key in enumerate(self._keys):
+            self._add_info(infos, {"key": key}, number)
         observation = self._observe()
         for place in np.flatnonzero(~self._over):
             state = self._states[place]
