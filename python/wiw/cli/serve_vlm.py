@@ -61,12 +61,12 @@ def _make_client(model: str, seed: int, folder: str) -> Any:
     from wiw.vlm.transformers import TransformersClient
 
     if model == "mock":
-        return MockClient()
+        return MockClient(record=False)
     if ".py:" in model:
         script = Registry("script", "", {}).find(model)
         file, _, function = model.rpartition(":")
         digest = blake2b(
             Path(file).expanduser().read_bytes(), digest_size=4
         ).hexdigest()  # answers are kept by this name
-        return MockClient(script, model=f"{function}-{digest}")
+        return MockClient(script, model=f"{function}-{digest}", record=False)
     return TransformersClient(make_tiny(Path(folder) / f"tiny-{seed}", seed) if model == "tiny" else model)

@@ -21,7 +21,6 @@ from wiw.errors import ArgumentError, Error
 from wiw.vlm.base import Client
 from wiw.vlm.images import from_data_uri
 from wiw.vlm.messages import Call, Completion, Message, Part
-from wiw.vlm.mock import MockClient
 from wiw.wire.loopback import is_loopback
 
 MOST_BYTES = 256 << 20
@@ -89,9 +88,7 @@ class VlmServer:
         return self
 
     def serve(self) -> None:
-        """Serve until it is interrupted; a mock records no calls meanwhile, whose images would fill the memory."""
-        if isinstance(self.client, MockClient):
-            self.client.record = False
+        """Serve until it is interrupted."""
         self._http.serve_forever()
 
     def stop(self) -> None:

@@ -30,6 +30,7 @@ pydantic = pytest.importorskip("pydantic")
 pytest.importorskip("openai")
 
 from misbehaviour import FAULTS, MisbehavingVlmServer, Misbehaviour  # noqa: E402
+from wiw.cli.serve_vlm import _make_client  # noqa: E402
 from wiw.errors import ArgumentError, VlmError  # noqa: E402
 from wiw.serving import vlm_server  # noqa: E402
 from wiw.serving.vlm_server import VlmServer  # noqa: E402
@@ -397,13 +398,14 @@ def test_clients_that_hung_up_have_no_turn() -> None:
         assert sorted(parts_of(call)[0] for call in client.calls) == ["first", "patient"]
 
 
-def test_a_mock_served_by_the_command_records_no_calls(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(vlm_server._Http, "serve_forever", lambda self: None)
-    server = VlmServer(MockClient(lambda call: "fine"))
-    server.serve()
-    server._http.server_close()
-    server.client.ask(REQUESTS[2:3])
-    assert server.client.calls == []
+def test_a_mock_served_by_the_command_records_no_calls(tmp_path: Path) -> None:
+    """Their images would fill the memory of a server that runs for days."""
+    script = tmp_path / "script.py"
+    script.write_text("def answer(call):\n    return 'fine'\n")
+    for name in ("mock", f"{script}:answer"):
+        client = _make_client(name, 0, str(tmp_path))
+        client.ask(REQUESTS[2:3])
+        assert isinstance(client, MockClient) and client.calls == []
 
 
 def test_what_was_answered_before_a_failure_is_kept(tmp_path: Path) -> None:
