@@ -71,7 +71,13 @@ class AgentConfig(PlanConfig):
 
         Changing the horizon does not change how many actions are executed, and so an episode's budget, unless plans
         become shorter than that.
+
+        Raises:
+            ArgumentError: more actions are to be executed than plans of this task have.
         """
+        longest = max(self.horizon or defaults.get("horizon", 0), defaults.get("execute", 0))
+        if self.execute is not None and 0 < longest < self.execute:
+            raise ArgumentError(f"agent: expected execute of at most {longest}, a plan's length, got {self.execute}")
         open_names = {name for name, value in self.numbers.items() if value is None}
         taken = {name: value for name, value in defaults.items() if name in open_names}
         if self.horizon is not None and "execute" in taken:

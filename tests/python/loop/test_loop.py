@@ -355,6 +355,10 @@ def test_a_task_settles_what_an_agent_leaves_open() -> None:
     own = AgentConfig(horizon=9).resolve({"candidates": 4, "horizon": 5, "execute": 3}).complete()
     assert (own.candidates, own.horizon, own.execute) == (4, 9, 3), "another horizon, the same budget"
     short = AgentConfig(horizon=2).resolve({"candidates": 4, "horizon": 5, "execute": 3})
+    routes = {"candidates": 3, "horizon": 21, "execute": 50}  # of a task in which a policy walks whole routes
+    assert AgentConfig(execute=40).resolve(routes).complete().execute == 40
+    with pytest.raises(ArgumentError, match="expected execute of at most 5, a plan's length, got 9"):
+        AgentConfig(execute=9).resolve({"candidates": 4, "horizon": 5, "execute": 3})
     assert short.execute == 2
     bare = agent.replace(model=None)
     assert bare.model is None and bare.config.candidates == 2 and agent.model is not None
