@@ -105,7 +105,8 @@ def run(server: VlmServer, options: Any, tmp_path: Path) -> Callable[[str, Any],
         server.client.calls.clear()
         space = "pose7" if task == "manipulation" else "discrete"
         asked: Any = {"model": "scripted", "dialect": "vllm", "proposals": "listed", "cache": "off"}
-        asked["tracker"] = "reprojection"  # frames of models here show nothing that could be followed
+        if task == "ar":
+            asked["tracker"] = "reprojection"  # frames of models here show nothing that could be followed
         policy = wiw.policy("vlm", vlm=server.url, space=space, **asked)
         labels = "simulator" if model is not None and "semantic" in model.accepts.needs else None
         agent = AgentRecipe(policy, model, semantics=labels, candidates=2, horizon=2)

@@ -232,7 +232,9 @@ def test_rednet_labels_what_the_model_is_given(two_rooms: str, reader: str, tmp_
     assert recipe.describe()["semantics_options"]["face"] == 32
     context = RunContext(ImageNav(scenes=two_rooms))
     agent = AgentRecipe.from_json(recipe.to_json()).build(context)
-    assert agent.describe()["semantics"] == {"name": "RedNet", "weights": "tiny.pth", "face": 32, "metres": [0.0, 10.0]}
+    described = agent.describe()["semantics"]
+    assert len(described.pop("weights")) == 32, "a digest"
+    assert described == {"name": "RedNet", "face": 32, "metres": [0.0, 10.0]}
     agent.decide_batch([query(begin(two_rooms))])
     shown = type(agent.model.unwrapped).seen[-1]
     assert shown.min() >= 1 and shown.max() <= 40 and len(np.unique(shown)) > 1
