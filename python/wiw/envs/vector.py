@@ -88,10 +88,7 @@ class VectorEnv(gymnasium.vector.VectorEnv[dict[str, Any], NDArray[np.int64], ND
         self._over[:] = False
         self._next = max(numbers) + 1  # not of `indices`: after a wrap the next one is not the first again
         self._keys = [Key(self.task.seed, index) for index in indices]
-        infos: dict[str, Any] = {}
-        for place, key in enumerate(self._keys):
-            self._add_info(infos, {"key": key}, place)
-        return self._observe(), infos
+        return self._observe(), self._describe_keys()
 
     def step(
         self, actions: ArrayLike
@@ -101,7 +98,6 @@ class VectorEnv(gymnasium.vector.VectorEnv[dict[str, Any], NDArray[np.int64], ND
         """
         self._require_episodes()
         primitives, answers = self._decode(actions)
-        infos: dict[str, Any] = {}
         for place in np.flatnonzero(self._over):
             self._start_over(int(place))
         self._core.step(np.where(self._over, NULL, primitives).astype(np.int8))
@@ -115,9 +111,7 @@ class VectorEnv(gymnasium.vector.VectorEnv[dict[str, Any], NDArray[np.int64], ND
                 state.record_answer(self.task, answer, final=True)
             state.observed.append(len(state.positions) - 1)
             self._keys[place] = self._keys[place].at(self._keys[place].decision + 1)
-        for number, key in enumerate(self._keys):
-            self._add_info(infos, {"key": key}, number)
-        observation = self._observe()
+        observation, infos = self._observe(), self._describe_keys()
         for place in np.flatnonzero(~self._over):
             state = self._states[place]
             terminated[place], truncated[place] = state.ended, not state.ended and state.is_out_of_budget(self.task)
@@ -163,6 +157,13 @@ class VectorEnv(gymnasium.vector.VectorEnv[dict[str, Any], NDArray[np.int64], ND
         index = wrap_episode(self.task, self._next)
         self._core[place], self._states[place], self._goals[place] = start_episode(self.task, self.task.episode(index))
         self._keys[place], self._next = Key(self.task.seed, index), index + 1
+
+    def _describe_keys(self) -> dict[str, Any]:
+        """Return infos with the key of each place's next decision."""
+        infos: dict[str, Any] = {}
+        for place, key in enumerate(self._keys):
+            self._add_info(infos, {"key": key}, place)
+        return infos
 
     def _observe(self) -> dict[str, Any]:
         images = self._core.observe(self._images)

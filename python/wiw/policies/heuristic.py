@@ -14,6 +14,8 @@ from wiw.errors import ArgumentError
 from wiw.policies.base import Policy, Situation
 from wiw.types import Proposal
 
+MAX_TURNS = 4
+"""Turns the same way in a row, at most, as in the paper."""
 INVERSE: dict[int, int] = {TURN_LEFT: TURN_RIGHT, TURN_RIGHT: TURN_LEFT}
 
 
@@ -31,7 +33,7 @@ class Heuristic(Policy):
 
     default_revision = "matcher"
 
-    def __init__(self, max_turns: int = 4) -> None:
+    def __init__(self, max_turns: int = MAX_TURNS) -> None:
         if isinstance(max_turns, bool) or not isinstance(max_turns, int) or max_turns < 1:
             raise ArgumentError(f"policy heuristic: expected a whole max_turns of at least 1, got {max_turns!r}")
         self.max_turns = max_turns
@@ -39,7 +41,7 @@ class Heuristic(Policy):
     def describe(self) -> dict[str, Any]:
         """Return a JSON-able identity, with `max_turns` where it is not the paper's."""
         own = super().describe()
-        return own if self.max_turns == 4 else {**own, "max_turns": self.max_turns}
+        return own if self.max_turns == MAX_TURNS else {**own, "max_turns": self.max_turns}
 
     def propose(self, situations: Sequence[Situation], candidates: int, horizon: int) -> list[list[Proposal]]:
         """Return independent random plans, keyed by (seed, episode, decision, candidate); the first is the base

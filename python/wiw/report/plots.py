@@ -80,7 +80,10 @@ def arm_colors(arms: Sequence[str]) -> dict[str, str]:
 def arm_markers(arms: Sequence[str]) -> dict[str, str]:
     """Return a marker per arm, which differs between arms of one colour."""
     others = [arm for arm in arms if arm not in ROLE_COLORS]
-    return {**dict.fromkeys(ROLE_COLORS, "o"), **{arm: MARKERS[i // len(PALETTE) % 4] for i, arm in enumerate(others)}}
+    return {
+        **dict.fromkeys(ROLE_COLORS, "o"),
+        **{arm: MARKERS[i // len(PALETTE) % len(MARKERS)] for i, arm in enumerate(others)},
+    }
 
 
 def success_by_arm(summary: Summary) -> Markup:
@@ -164,7 +167,7 @@ def draw_success_by_measures(found: QualityTable, measures: Mapping[str, str], f
         _style_axes(axes)
         _draw_success_by_measure(axes, found, measure, label)
     handles, texts = figure.axes[0].get_legend_handles_labels()
-    longest = max((len(line) for text in texts for line in text.split("\n")), default=0)
+    longest = _measure_longest(texts)
     columns = max(1, min(6, len(texts), LEGEND_WIDTH * len(measures) // (longest + 6)))
     figure.legend(handles, texts, frameon=False, labelcolor=INK, fontsize=9, ncols=columns, loc="outside upper left")
     return _draw_on_white(figure, form, "quality")
@@ -542,9 +545,14 @@ def _style_axes(axes: Axes) -> None:
     axes.set_axisbelow(True)
 
 
+def _measure_longest(texts: Sequence[str]) -> int:
+    """Return the characters of the longest line of a legend's texts."""
+    return max((len(line) for text in texts for line in text.split("\n")), default=0)
+
+
 def _draw_legend(axes: Axes) -> None:
     texts = axes.get_legend_handles_labels()[1]
-    longest = max((len(line) for text in texts for line in text.split("\n")), default=0)
+    longest = _measure_longest(texts)
     widest = 4 if longest < 11 else 2 if longest < 20 else 1  # columns that fit the drawing's width
     columns = math.ceil(len(texts) / math.ceil(len(texts) / widest)) if texts else 1  # rows of about equal length
     broken = sum(text.count("\n") for text in texts)

@@ -10,6 +10,7 @@ from __future__ import annotations
 from collections.abc import Collection, Mapping, Sequence
 from typing import Any
 
+from wiw.runs.recipes import CHANGES
 from wiw.runs.store import RunStore
 from wiw.types import Episode
 
@@ -17,8 +18,6 @@ POOL = 12
 """Episodes that keep pictures during a run; more if more are to keep them after it."""
 FLOORS, CEILING = ("copy", "none"), "oracle"
 """Names of arms that are not models under test; of the floors the first that the run has counts."""
-CHANGES = {"placebo", "error", "reseed"}
-"""What makes an agent a control, in its description."""
 
 
 def spread_evenly(episodes: Sequence[Episode], count: int) -> list[int]:
@@ -70,7 +69,7 @@ def choose_pictured_episodes(store: RunStore) -> list[int]:
         return [int(index) for index in info["pictures"]]
     last = info["stopped"]["episodes"] if "stopped" in info else None
     pool = [index for index in info["pictures"] if last is None or index < last]
-    controls = {arm["name"] for arm in store.config["arms"] if CHANGES & arm["agent"].keys()}
+    controls = {arm["name"] for arm in store.config["arms"] if arm["agent"].keys() & set(CHANGES)}
     return choose_episodes(store.episodes()[:last], pool, store.outcomes(), info["keep_images"], controls)
 
 

@@ -35,6 +35,8 @@ from wiw.world_models.base import WorldModel, find_accepts
 PLACEBO, PLACEBO_MODEL = "placebo-", "warp"
 """Beginning of the names of placebo arms, and the model that they use where nobody names one."""
 RESEEDED = "reseeded"
+CHANGES = ("placebo", "error", "reseed")
+"""Settings of an agent that make it a control: they change what is done with its world model."""
 """Begins arms that repeat another with other random numbers: the noise floor."""
 ERROR, ERROR_MODEL = "error-", "oracle"
 """Beginning of the names of arms with an error, and the model that they use where nobody names one."""
@@ -520,7 +522,7 @@ def require_reference(name: str, agent: AgentRecipe) -> AgentRecipe:
     Raises:
         ArgumentError: the arm has the name of a reference, and the agent another world model, or one that is changed.
     """
-    is_changed = any(change is not None for change in (agent.placebo, agent.error, agent.reseed))
+    is_changed = any(getattr(agent, name) is not None for name in CHANGES)
     if name in REFERENCES and (agent.arm != name or is_changed):
         raise ArgumentError(
             f"arms: the name '{name}' is reserved for the reference '{name}', got {agent.model}; choose another name"

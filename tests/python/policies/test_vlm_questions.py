@@ -184,9 +184,9 @@ START = np.zeros(3)
 
 
 def test_a_landmark_is_walked_to_and_around_what_stands_in_the_way() -> None:
-    straight = steering.follow_route(open_floor(), START, thing(2.1, 0.0), HORIZON)
+    straight = steering.cut_plan(steering.find_route(open_floor(), START, thing(2.1, 0.0)), HORIZON)
     assert straight.tolist() == [int(FORWARD)] * 7 and straight.dtype == np.int8
-    around = steering.follow_route(open_floor(wall=True), START, thing(2.2, 0.0), 60)
+    around = steering.cut_plan(steering.find_route(open_floor(wall=True), START, thing(2.2, 0.0)), 60)
     assert np.linalg.norm(end_of(around)[:2] - (2.2, 0)) <= 0.8 and len(around) > 12
     places = np.array([end_of(around[:k])[:2] for k in range(len(around) + 1)])
     inside = (places[:, 0] > 1.0) & (places[:, 0] < 1.2)
@@ -194,8 +194,9 @@ def test_a_landmark_is_walked_to_and_around_what_stands_in_the_way() -> None:
 
 
 def test_beside_a_landmark_the_agent_turns_to_it() -> None:
-    assert steering.follow_route(open_floor(), START, thing(0.0, 0.5), HORIZON).tolist() == [LEFT] * 4
-    assert steering.follow_route(open_floor(), START, thing(0.5, 0.0), HORIZON).tolist() == [LEFT] * 4, "look around"
+    beside, ahead = (steering.find_route(open_floor(), START, thing(*at)) for at in ((0.0, 0.5), (0.5, 0.0)))
+    assert steering.cut_plan(beside, HORIZON).tolist() == [LEFT] * 4
+    assert steering.cut_plan(ahead, HORIZON).tolist() == [LEFT] * 4, "look around"
 
 
 def test_the_turn_at_the_beginning_counts_as_one_action() -> None:

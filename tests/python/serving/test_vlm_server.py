@@ -301,7 +301,7 @@ def test_what_was_paid_for_is_counted_though_another_question_fails(tmp_path: Pa
 
 @pytest.mark.parametrize("concurrency", [1, 3])
 def test_what_was_paid_for_is_not_asked_again_though_another_question_fails(tmp_path: Path, concurrency: int) -> None:
-    """Of choices in rounds and votes, too, where one question takes several calls."""
+    """Keep those of choices in rounds and votes, too, where one question takes several calls."""
     failing_now = True
 
     def script(call: Any) -> Any:

@@ -242,7 +242,7 @@ def test_the_study_of_language_models_asks_each_server_for_its_part(tmp_path: Pa
 
 
 def test_a_line_that_is_no_arms_has_no_rollouts() -> None:
-    """Of questions, tables have a line for the best guess from the text alone."""
+    """Tables of question answering have a line for the best guess from the text alone."""
     log: Any = SimpleNamespace(table=lambda: [{"arm": "none"}, {"arm": "blind"}])
     part = StudyPart(SimpleNamespace(name="here"), log, SimpleNamespace(), (), {"none": 2.0})  # type: ignore[arg-type]
     assert part.as_dict()["arms"] == [{"arm": "none", "rollouts": 2.0}, {"arm": "blind"}]

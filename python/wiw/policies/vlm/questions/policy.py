@@ -44,9 +44,9 @@ class PlannedCommand:
 
     command: Command
     plan: Proposal
-    """What is imagined."""
+    """The plan as it is imagined."""
     way: NDArray[np.int8]
-    """What is carried out: the plan, unless a route goes on or other steps are imagined."""
+    """Primitives to carry out: the plan's, unless a route goes on or other steps are imagined."""
 
 
 @dataclass(kw_only=True)

@@ -26,11 +26,6 @@ def find_route(grid: OccupancyGrid, pose: NDArray[np.float64], landmark: Landmar
     return found if len(found) else route(grid, pose, measure_bearing(pose, landmark)).actions
 
 
-def follow_route(grid: OccupancyGrid, pose: NDArray[np.float64], landmark: Landmark, horizon: int) -> NDArray[np.int8]:
-    """Return the first primitives of the route to a landmark, or of the way towards it where the agent is there."""
-    return cut_plan(find_route(grid, pose, landmark), horizon)
-
-
 def measure_bearing(pose: NDArray[np.float64], landmark: Landmark) -> float:
     """Return the azimuth at which a landmark lies."""
     away = landmark.position[:2] - pose[:2]
