@@ -340,8 +340,17 @@ def _replay(options: Mapping[str, Any], run: Path) -> dict[str, Any]:
     """Return a policy's options with a run's recorded answers in place of all models, those of its roles included."""
     replayed = {**options, "vlm": f"replay:{run}", "cache": "off"}
     if roles := options.get("roles"):
-        replayed["roles"] = {role: _leave_out(own, "vlm") for role, own in roles.items()}
+        replayed["roles"] = {role: _replay_role(own, options.get("vlm"), run) for role, own in roles.items()}
     return replayed
+
+
+def _replay_role(own: Mapping[str, Any], main: Any, run: Path) -> dict[str, Any]:
+    """Return a role's options. If it has a server of its own, the run's path is spelt differently from the main
+    server's, so that the role does not get the options that describe that server.
+    """
+    if own.get("vlm") in (None, main):
+        return _leave_out(own, "vlm")
+    return {**own, "vlm": f"replay:{run / 'run.sqlite'}"}
 
 
 def _leave_out(options: Mapping[str, Any], *names: str) -> dict[str, Any]:

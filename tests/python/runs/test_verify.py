@@ -3,6 +3,7 @@ from __future__ import annotations
 
 import json
 import sqlite3
+from dataclasses import replace
 
 import pytest
 from fakes import LineAgent, LineTask
@@ -11,6 +12,7 @@ from locations import PYTHON_TESTS
 import wiw
 from wiw.cli import main
 from wiw.errors import ArgumentError, StoreError
+from wiw.policies.vlm.policy import _get_role_options
 from wiw.runs.recipes import AgentRecipe, TaskRecipe
 from wiw.runs.store_file import store_path
 from wiw.studies.evaluate import evaluate, run_arms
@@ -54,8 +56,23 @@ def test_models_of_roles_are_replayed_too(tmp_path):
     recipe = AgentRecipe("vlm", policy_options={"vlm": {"vlm": "http://x/v1", "model": "a", "roles": roles}})
     replayed = recipe.replaying(tmp_path).policy_options["vlm"]
     assert (replayed["vlm"], replayed["cache"], replayed["model"]) == (f"replay:{tmp_path}", "off", "a")
-    assert replayed["roles"] == {"revise": {"model": "b"}, "answer": {"model": "c"}}
+    other = {"vlm": f"replay:{tmp_path / 'run.sqlite'}", "model": "b"}
+    assert replayed["roles"] == {"revise": other, "answer": {"model": "c"}}
+    same = replace(recipe, policy_options={"vlm": {"vlm": "http://gone:8000/v1", "model": "a", "roles": roles}})
+    assert same.replaying(tmp_path).policy_options["vlm"]["roles"]["revise"] == {"model": "b"}
     assert "gone" in str(recipe.policy_options)  # the recipe itself is as it was
+
+
+def test_a_role_at_another_server_is_replayed_with_its_own_options(tmp_path):
+    """With those of the main server it would be asked in another way than in the run, and no answer found."""
+    given = {"top_logprobs": 5}
+    roles = {"revise": {"vlm": "http://y/v1", "model": "internvl3-78b-awq"}, "answer": {"model": "internvl3-78b-awq"}}
+    options = {"vlm": "http://x/v1", "model": "a", **given, "roles": roles}
+    replayed = AgentRecipe("vlm", policy_options={"vlm": options}).replaying(tmp_path).policy_options["vlm"]
+    for role, expected in (("revise", 20), ("answer", 5)):
+        live = _get_role_options(roles[role], options["vlm"], given)
+        assert live["top_logprobs"] == expected
+        assert _get_role_options(replayed["roles"][role], replayed["vlm"], given) == live
 
 
 def test_with_a_world_model_pictures_and_several_arms(two_rooms, tmp_path):
