@@ -1,5 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The recogniser's input for a target: a close and a wide view centred on its box, and the box's angles."""
+"""The recogniser's input for a target: a close and a wide view centred on its box, the box's angles, and its extent in
+metres where depth is known.
+"""
 
 from __future__ import annotations
 
@@ -27,8 +29,18 @@ STEP = 1.2
 """Fields of view are powers of it, so that look-up tables are shared."""
 PITCH_STEP = 3.0
 """Degrees; views look up and down in whole steps, for the same reason."""
-SCALARS = 5
-"""Width and height of the box, elevation of its upper and lower edge (radians), whether the view is real."""
+SCALARS = 9
+"""Width and height of the box, elevation of its upper and lower edge (radians), whether the view is real; the four of
+`measure_extent`, zeros where depth is unknown.
+"""
+EXTENT = slice(5, 9)
+"""The columns of `measure_extent`."""
+CAMERA_HEIGHT = 1.0
+"""Metres above the floor."""
+CUT_OFF = 3.0
+"""Percentage of a target's pixels ignored at either end of each axis: those whose depth is of what is behind."""
+SHORTEST = 0.01
+"""Minimum length in metres of a measured extent, which tells it from an unknown one."""
 
 
 @dataclass(frozen=True)
@@ -40,7 +52,7 @@ class Glimpses:
     boxes: NDArray[np.float32]
     """float32 [N, 2, 4]: left, top, right, bottom in each, 0 to 1."""
     scalars: NDArray[np.float32]
-    """float32 [N, 5], see `SCALARS`."""
+    """float32 [N, 9], see `SCALARS`."""
 
     def __post_init__(self) -> None:
         count = len(self.images)
@@ -70,14 +82,20 @@ def join_glimpses(parts: Sequence[Glimpses]) -> Glimpses:
 
 
 def extract_glimpses(
-    panoramas: NDArray[np.uint8], masks: NDArray[np.bool_], real: NDArray[np.bool_]
+    panoramas: NDArray[np.uint8],
+    masks: NDArray[np.bool_],
+    real: NDArray[np.bool_],
+    depths: Sequence[NDArray[np.float32] | None] | None = None,
 ) -> tuple[Glimpses, NDArray[np.int64]]:
     """Extract glimpses of the target from those of K panoramas that show it; return them with the panoramas' indices.
 
     Args:
         panoramas: uint8 [K, H, W, 3].
-        masks: bool [K, H, W]: the target's pixels; only the box around them is used.
+        masks: bool [K, H, W]: the target's pixels. Views are centred on the box around them; only extents depend on
+            the pixels themselves.
         real: bool [K]: True where the panorama is an observation, False where it is imagined.
+        depths: K maps, float32 [H, W]: metres along the ray, 0 where unknown; None for panoramas without depth, such as
+            imagined ones. None means that none of them has depth.
 
     Raises:
         ArgumentError: arrays of other shapes.
@@ -91,11 +109,43 @@ def extract_glimpses(
         raise ArgumentError(
             f"extract_glimpses: expected one flag per panorama [{len(panoramas)}], got {np.shape(real)}"
         )
+    maps = [None] * len(panoramas) if depths is None else list(depths)
+    unlike = [np.shape(depth) for depth in maps if depth is not None and np.shape(depth) != masks.shape[1:]]
+    if len(maps) != len(panoramas) or unlike:
+        raise ArgumentError(
+            f"extract_glimpses: expected depth {masks.shape[1:]} or None per panorama [{len(panoramas)}], got "
+            f"{unlike[0] if unlike else len(maps)}"
+        )
     frames = np.flatnonzero(masks.any(axis=(1, 2)))
-    return join_glimpses([_extract_glimpse(panoramas[k], masks[k], bool(real[k])) for k in frames]), frames
+    return join_glimpses([_extract_glimpse(panoramas[k], masks[k], bool(real[k]), maps[k]) for k in frames]), frames
 
 
-def _extract_glimpse(image: NDArray[np.uint8], mask: Mask, real: bool) -> Glimpses:
+def measure_extent(mask: Mask, depth: NDArray[np.float32]) -> NDArray[np.float64]:
+    """Measure a target in metres: its longest extent along the floor, the one across, and the heights above the floor
+    of its lower and upper end.
+
+    Extents along the floor are along the principal axes of the visible points. Each measure ignores `CUT_OFF` percent
+    of the points at either end. The camera is taken to be `CAMERA_HEIGHT` above the floor on which the target stands.
+
+    Args:
+        mask: bool [H, W]: the target's pixels in a panorama.
+        depth: float32 [H, W]: metres along the ray, 0 where unknown.
+
+    Returns:
+        float64 [4]; zeros if no pixel of the target has depth, else both extents are at least `SHORTEST`.
+    """
+    pixels = np.flatnonzero(mask & np.isfinite(depth) & (depth > 0))
+    if not len(pixels):
+        return np.zeros(4)
+    points = _get_rays(*mask.shape)[pixels].astype(np.float64) * depth.ravel()[pixels, None]
+    flat = points[:, [0, 2]] - points[:, [0, 2]].mean(axis=0)
+    _, axes = np.linalg.eigh(flat.T @ flat)
+    span = np.percentile(flat @ axes, [CUT_OFF, 100 - CUT_OFF], axis=0)
+    lengths = np.sort(np.maximum(span[1] - span[0], SHORTEST))[::-1]
+    return np.array([*lengths, *(CAMERA_HEIGHT + np.percentile(points[:, 1], [CUT_OFF, 100 - CUT_OFF]))])
+
+
+def _extract_glimpse(image: NDArray[np.uint8], mask: Mask, real: bool, depth: NDArray[np.float32] | None) -> Glimpses:
     yaw, pitch = _find_direction(mask)
     x, y, elevation = _compute_angles(mask, yaw, pitch)
     close = _quantise_field(float(max(np.abs(x).max(), np.abs(y).max())) / CLOSE_FILL)
@@ -103,7 +153,8 @@ def _extract_glimpse(image: NDArray[np.uint8], mask: Mask, real: bool) -> Glimps
     half = np.pi / image.shape[1]  # of a pixel, whose rays pass through its middle
     extent = np.array([x.min() - half, -y.max() - half, x.max() + half, half - y.min()])
     width, height = np.arctan([extent[2] - extent[0], extent[3] - extent[1]])
-    scalars = [width, height, elevation.max() + half, elevation.min() - half, float(real)]
+    measured = np.zeros(4) if depth is None else measure_extent(mask, depth)
+    scalars = [width, height, elevation.max() + half, elevation.min() - half, float(real), *measured]
     return Glimpses(
         np.stack([_cut_view(image, yaw, pitch, field) for field in fields])[None],
         np.stack([np.clip((extent / field + 1) / 2, 0, 1) for field in fields])[None].astype(np.float32),

@@ -76,7 +76,7 @@ class Recogniser:
                 f"recogniser --out {path}`"
             ) from error
         try:
-            network = Network(len(header["categories"]), int(header["width"]), bool(header.get("sizes", False)))
+            network = Network(len(header["categories"]), int(header["width"]), bool(header.get("extents", False)))
             missing, unknown = network.load_state_dict(weights, strict=False)
             absent = [name for name in missing if not name.endswith("num_batches_tracked")]
             if absent or unknown:
@@ -101,7 +101,7 @@ class Recogniser:
         header = {
             "categories": list(self.categories),
             "width": self.network.width,
-            "sizes": self.network.sizes,
+            "extents": self.network.extents,
             "temperature": self.temperature,
             "card": self.card,
         }

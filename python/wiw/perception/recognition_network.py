@@ -8,16 +8,16 @@ from typing import Any
 import torch
 from torch import Tensor, nn
 
-from wiw.perception.glimpses import SCALARS, SIDE
+from wiw.perception.glimpses import CAMERA_HEIGHT, EXTENT, SHORTEST, SIDE
 
 CHANNELS = 8
 """Colour and box of the close and of the wide view."""
-CAMERA_HEIGHT = 1.0
-"""Metres above the floor."""
+ANGLES = 5
+"""Columns of `Glimpses.scalars` before those of the extent."""
 FARTHEST = 8.0
 """Metres beyond which a distance is not estimated."""
-SIZES = 3
-"""Columns of `estimate_sizes`."""
+SIZES = 8
+"""Columns of `estimate_sizes` and `encode_extents` together."""
 
 
 def to_network_input(images: Tensor, boxes: Tensor) -> Tensor:
@@ -38,16 +38,28 @@ def to_network_input(images: Tensor, boxes: Tensor) -> Tensor:
 
 
 def estimate_sizes(scalars: Tensor) -> Tensor:
-    """Return sizes of targets in metres, as if their lower edges were on the floor: float [N, 3], from [N, 5].
+    """Return sizes of targets in metres, as if their lower edges were on the floor: float [N, 3], from [N, 9].
 
     Logarithms of distance and width, and the height of the upper edge. Objects that stand on something else, or whose
     lower edge is hidden, are taken to be farther away, in training too.
     """
-    width, _, upper, lower, _ = scalars.unbind(dim=1)
+    width, _, upper, lower = scalars[:, :4].unbind(dim=1)
     distance = (CAMERA_HEIGHT / torch.tan(-lower).clamp_min(CAMERA_HEIGHT / FARTHEST)).clamp_min(0.1)
     broad = 2 * distance * torch.tan(width.clamp(0.01, 2.5) / 2)
     top = CAMERA_HEIGHT + distance * torch.tan(upper.clamp(-1.4, 1.4))
     return torch.stack([distance.log(), broad.log(), top.clamp(-1.0, 4.0)], dim=1)
+
+
+def encode_extents(scalars: Tensor) -> Tensor:
+    """Return what depth tells of targets' sizes: float [N, 5], from [N, 9].
+
+    Whether it was measured, logarithms of both extents, and the heights of the lower and upper end; zeros where it was
+    not.
+    """
+    extent = scalars[:, EXTENT]
+    known = (extent[:, :1] > 0).float()
+    lengths = extent[:, :2].clamp(SHORTEST, 10.0).log()
+    return known * torch.cat([known, lengths, extent[:, 2:].clamp(-1.0, 4.0)], dim=1)
 
 
 def _build_block(inputs: int, outputs: int, stride: int) -> nn.Sequential:
@@ -66,12 +78,12 @@ class Network(nn.Module):
     Args:
         categories: number of logits.
         width: channels of the first layer.
-        sizes: whether it receives estimates of sizes in metres (`estimate_sizes`).
+        extents: whether it is also told sizes in metres (`estimate_sizes`, `encode_extents`).
     """
 
-    def __init__(self, categories: int, width: int = 32, sizes: bool = False) -> None:
+    def __init__(self, categories: int, width: int = 32, extents: bool = False) -> None:
         super().__init__()
-        self.categories, self.width, self.sizes = categories, width, sizes
+        self.categories, self.width, self.extents = categories, width, extents
         self.trunk = nn.Sequential(
             _build_block(CHANNELS, width, 2),
             _build_block(width, 2 * width, 2),
@@ -79,7 +91,7 @@ class Network(nn.Module):
             _build_block(3 * width, 3 * width, 1),
             _build_block(3 * width, 4 * width, 2),
         )
-        self.mix = nn.Sequential(nn.Linear(2 * 4 * width + SCALARS + SIZES * sizes, 4 * width), nn.ReLU(inplace=True))
+        self.mix = nn.Sequential(nn.Linear(2 * 4 * width + ANGLES + SIZES * extents, 4 * width), nn.ReLU(inplace=True))
         self.drop = nn.Dropout(0.2)
         self.logits = nn.Linear(4 * width, categories)
         self.weight = nn.Linear(4 * width, 1)
@@ -87,19 +99,12 @@ class Network(nn.Module):
         nn.init.zeros_(self.weight.weight)
         nn.init.zeros_(self.weight.bias)
 
-    def continue_from(self, start: Network) -> None:
-        """Copy the weights of a network of the same categories and width; sizes it does not receive get no weight."""
-        state = dict(start.state_dict())
-        if self.sizes and not start.sizes:
-            state["mix.0.weight"] = nn.functional.pad(state["mix.0.weight"], (0, SIZES))
-        self.load_state_dict(state)
-
     def encode_glimpses(self, pictures: Tensor, scalars: Tensor) -> tuple[Tensor, Tensor]:
         """Return logits [N, categories] and weights [N] of single glimpses."""
         maps = self.trunk(pictures)
-        pooled = [maps.mean(dim=(2, 3)), maps.amax(dim=(2, 3)), scalars]
-        if self.sizes:
-            pooled.append(estimate_sizes(scalars))
+        pooled = [maps.mean(dim=(2, 3)), maps.amax(dim=(2, 3)), scalars[:, :ANGLES]]
+        if self.extents:
+            pooled += [estimate_sizes(scalars), encode_extents(scalars)]
         mixed = self.drop(self.mix(torch.cat(pooled, dim=1)))
         return self.logits(mixed), nn.functional.softplus(self.weight(mixed)[:, 0]) + 1e-3
 

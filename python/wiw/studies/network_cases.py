@@ -118,9 +118,9 @@ def _draw_navigator(network: Any, batch: int) -> Inputs:
 
 def _make_recogniser() -> nn.Module:
     from wiw.perception.recogniser import Recogniser
-    from wiw.policies.recogniser.policy import WEIGHTS
+    from wiw.policies.recogniser.policy import SHIPPED
 
-    return Recogniser.load(WEIGHTS).network
+    return Recogniser.load(SHIPPED["pictures"]).network
 
 
 def _draw_recogniser(network: Any, batch: int) -> Inputs:

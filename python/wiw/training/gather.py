@@ -96,7 +96,7 @@ def gather_glimpse_sets(
         ArgumentError: the scenes have no object of `categories`.
     """
     make = partial(_build_glimpse_sets, seed=seed, categories=tuple(categories), rules=rules)
-    job = Job(f"glimpses in {specs}", GLIMPSE_SET_FIELDS, make, (2, list(categories), seed, asdict(rules)))
+    job = Job(f"glimpses in {specs}", GLIMPSE_SET_FIELDS, make, (3, list(categories), seed, asdict(rules)))
     return merge_glimpse_sets(_gather_sets(specs, job, folder, workers, bar))
 
 
@@ -111,7 +111,7 @@ def gather_hard_sets(
         FileError: the folder cannot be written.
     """
     make = partial(_build_hard_sets, seed=seed, categories=tuple(categories))
-    identity = ("hard", 1, list(categories), seed, asdict(HARD_LOOKS), list(WAY_SHARES))
+    identity = ("hard", 2, list(categories), seed, asdict(HARD_LOOKS), list(WAY_SHARES))
     job = Job(f"hard looks in {specs}", GLIMPSE_SET_FIELDS, make, identity)
     return join_glimpse_sets(_gather_sets(specs, job, folder, workers, bar))
 

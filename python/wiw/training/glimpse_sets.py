@@ -257,20 +257,22 @@ def _build_sets(
     """Build a set for each object that `choose` picks among the ids seen from the first point, uint32 [H, W]."""
     poses = np.stack([camera_pose(spot, 0.0) for spot in points])
     shown = world.renderer.panorama(poses)
-    color, depth, ids = shown["color"], shown["depth"][0], shown["instance"]
+    color, depth, ids = shown["color"], shown["depth"], shown["instance"]
     things = choose(ids[0])
     if not things:
         return []
     relative = np.linalg.inv(poses[0]) @ poses[1:]
-    imagined = warp(color[:1], depth[None], relative[None])[0] if len(relative) else color[1:]
+    imagined = warp(color[:1], depth[:1], relative[None])[0] if len(relative) else color[1:]
     panoramas = np.concatenate([color, color[1:], imagined])
     kinds = np.repeat([START, NEAR, PERFECT, WARPED], [1, *[len(relative)] * 3])
+    depths = [*depth, *[None] * (2 * len(relative))]
     here = np.array([ids[0] == thing for thing in things])
-    moved = reproject_masks(here, depth, relative, depth.shape)[0] if len(relative) else here[:, None][:, :0]
+    moved = reproject_masks(here, depth[0], relative, depth.shape[1:])[0] if len(relative) else here[:, None][:, :0]
     sets = []
     for thing, masks in zip(things, moved, strict=True):
         tracked = remove_specks(masks)
-        found, frames = extract_glimpses(panoramas, np.concatenate([ids == thing, tracked, tracked]), kinds <= NEAR)
+        followed = np.concatenate([ids == thing, tracked, tracked])
+        found, frames = extract_glimpses(panoramas, followed, kinds <= NEAR, depths)
         if not len(frames) or frames[0]:  # nothing of it is in the panorama, which has coarser pixels than the survey
             continue
         sets.append(GlimpseSets(found, np.zeros(len(frames), np.int64), kinds[frames], labels[[thing]]))

@@ -17,6 +17,7 @@ from wiw._core import core
 from wiw.datasets.ar import CATEGORIES
 from wiw.errors import ArgumentError
 from wiw.perception.calibration import calibration_error, fit_temperature, softmax
+from wiw.perception.glimpses import EXTENT
 from wiw.perception.recogniser import Recogniser
 from wiw.perception.recognition_network import Network, to_network_input
 from wiw.training.gather import gather_glimpse_sets, gather_hard_sets, require_held_out
@@ -51,8 +52,8 @@ class Recipe:
     """Glimpse sets in a batch."""
     width: int = 32
     """Channels of the first layer."""
-    sizes: bool = True
-    """Whether the network receives estimates of sizes in metres."""
+    extents: bool = True
+    """Whether the network is told sizes in metres, too."""
     rate: float = 3e-3
     decay: float = 0.02
     smoothing: float = 0.05
@@ -66,6 +67,13 @@ class Recipe:
     """Share of glimpses whose surroundings are those of another one."""
     degrade: float = 0.25
     """Share of glimpses that are blurred, of those with noise, and of those with a part covered."""
+    resize: float = 1.25
+    """Greatest factor by which the measured extents of a set are multiplied or divided, along each axis."""
+    unmeasured: float = 0.25
+    """Share of sets whose extents are unknown."""
+    swap: float = 0.3
+    """Share of glimpses whose picture is of something else, so that measured extents also count where furniture looks
+    unlike any that was trained on."""
     seed: int = 0
 
     def __post_init__(self) -> None:
@@ -104,8 +112,8 @@ def make_weights(
         The recogniser in the file, with its card.
 
     Raises:
-        ArgumentError: scenes that are both trained and evaluated on, or have no object of the categories; a start of
-            other categories or another width.
+        ArgumentError: scenes that are both trained and evaluated on, or have no object of the categories; a start that
+            does not fit.
         FileError: a file cannot be written.
     """
     require_held_out(scenes, val)
@@ -140,19 +148,16 @@ def train(
         recipe: how to train; see `Recipe`.
         minutes: if given, reduces the number of epochs so that training takes about this long.
         on_step: called after each step with its number, the number of all steps and a running mean of the loss.
-        start: network of the same categories and width whose training continues; None for a new one.
+        start: network of the same kind whose training continues; None for a new one.
 
     Raises:
-        ArgumentError: `start` has other categories or another width.
+        ArgumentError: `start` has other categories, another width, or is told sizes where this one is not.
     """
-    if start is not None and (start.categories, start.width) != (len(categories), recipe.width):
+    expected = (len(categories), recipe.width, recipe.extents)
+    if start is not None and (start.categories, start.width, start.extents) != expected:
         raise ArgumentError(
-            f"recogniser: expected a start of {len(categories)} categories and width {recipe.width}, got "
-            f"{start.categories} and {start.width}"
-        )
-    if start is not None and start.sizes and not recipe.sizes:
-        raise ArgumentError(
-            "recogniser: the weights to start from use sizes, so the recipe must, too; expected sizes=True, got False"
+            "recogniser: expected a start of {} categories, width {} and extents {}".format(*expected)
+            + f", got {start.categories}, {start.width} and {start.extents}"
         )
     steps_per_epoch = max(1, len(data) // recipe.batch)
     trainer, recipe = run_training(
@@ -174,10 +179,10 @@ class _Trainer:
     ) -> None:
         torch.manual_seed(core.fold_key([recipe.seed, 0x4C01]) % 2**63)
         self.data, self.recipe = data, recipe
-        network = Network(len(categories), recipe.width, recipe.sizes)
+        network = Network(len(categories), recipe.width, recipe.extents)
         self.network = network.to(memory_format=torch.channels_last)  # type: ignore[call-overload]
         if start is not None:
-            self.network.continue_from(start)
+            self.network.load_state_dict(start.state_dict())
         self._rng = np.random.default_rng(core.fold_key([recipe.seed, 0x4C02]))
         self._optimiser = torch.optim.AdamW(self.network.parameters(), recipe.rate, weight_decay=recipe.decay)
         self._sampling_weights = _compute_sampling_weights(data.labels)
@@ -263,11 +268,13 @@ def _augment(
 
     All glimpses of a set are recoloured alike, as they show one object; what degrades a picture is each one's own.
     """
-    found = data.glimpses[rows]
+    pictured = np.where(rng.random(len(rows)) < recipe.swap, rng.permutation(rows), rows)
+    found = replace(data.glimpses[pictured], scalars=data.glimpses.scalars[rows])
     extent = found.boxes[..., 2:] - found.boxes[..., :2]
     off = rng.uniform(-0.04, 0.04, (len(rows), 1, 4)) * np.concatenate([extent, extent], axis=-1)
     scalars = found.scalars * rng.uniform(0.96, 1.04, found.scalars.shape)
     scalars[:, REAL_COLUMN] = found.scalars[:, REAL_COLUMN]
+    scalars[:, EXTENT] *= _draw_extent_factors(int(owners.max()) + 1, recipe, rng)[owners]
     shown = to_network_input(torch.from_numpy(found.images), torch.from_numpy((found.boxes + off).astype(np.float32)))
     colours, boxes = _split_channels(shown)
     colours = _recolor(colours, boxes, owners, recipe.recolor, rng)
@@ -276,6 +283,12 @@ def _augment(
     mirrored = torch.from_numpy(rng.random(len(rows)) < 0.5)
     shown = torch.where(mirrored[:, None, None, None], shown.flip(3), shown)
     return shown.contiguous(memory_format=torch.channels_last), torch.from_numpy(scalars.astype(np.float32))
+
+
+def _draw_extent_factors(sets: int, recipe: Recipe, rng: np.random.Generator) -> NDArray[np.float64]:
+    """Return [sets, 4]: factors of furniture of other sizes, the two heights alike; 0 where extents are unknown."""
+    factors = recipe.resize ** rng.uniform(-1, 1, (sets, 3))
+    return factors[:, [0, 1, 2, 2]] * (rng.random((sets, 1)) >= recipe.unmeasured)
 
 
 def _split_channels(shown: Tensor) -> tuple[Tensor, Tensor]:

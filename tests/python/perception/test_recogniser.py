@@ -17,7 +17,19 @@ from hypothesis import strategies as st
 from wiw.errors import ArgumentError, DependencyError, FileError
 from wiw.panorama import directions
 from wiw.perception.calibration import calibration_error, fit_temperature, softmax
-from wiw.perception.glimpses import CLOSE_FILL, SIDE, STEP, WIDE_FACTOR, Glimpses, extract_glimpses, join_glimpses
+from wiw.perception.glimpses import (
+    CAMERA_HEIGHT,
+    CLOSE_FILL,
+    EXTENT,
+    SHORTEST,
+    SIDE,
+    STEP,
+    WIDE_FACTOR,
+    Glimpses,
+    extract_glimpses,
+    join_glimpses,
+    measure_extent,
+)
 
 NAMES = ("chair", "bed", "plant")
 
@@ -39,7 +51,7 @@ def noise(count: int, seed: int) -> Glimpses:
     rng = np.random.default_rng(seed)
     images = rng.integers(0, 256, (count, 2, SIDE, SIDE, 3), np.uint8)
     boxes = np.sort(rng.random((count, 2, 2, 2)), axis=2).reshape(count, 2, 4)
-    return Glimpses(images, boxes.astype(np.float32), rng.random((count, 5)).astype(np.float32))
+    return Glimpses(images, boxes.astype(np.float32), rng.random((count, 9)).astype(np.float32))
 
 
 # -- looks -------------------------------------------------------------------------------------------------------------
@@ -87,10 +99,76 @@ def test_frames_without_the_target_give_no_look() -> None:
         extract_glimpses(np.zeros((2, 8, 16, 3), np.uint8), np.zeros((1, 8, 16), bool), np.ones(2, bool))
     with pytest.raises(ArgumentError, match="flag"):
         extract_glimpses(np.zeros((2, 8, 16, 3), np.uint8), np.zeros((2, 8, 16), bool), np.ones(3, bool))
+    with pytest.raises(ArgumentError, match=r"expected depth \(8, 16\) or None per panorama \[2\], got \(8, 8\)"):
+        extract_glimpses(
+            np.zeros((2, 8, 16, 3), np.uint8),
+            np.zeros((2, 8, 16), bool),
+            np.ones(2, bool),
+            [None, np.ones((8, 8), np.float32)],
+        )
     with pytest.raises(ArgumentError, match="boxes"):
         Glimpses(found.images, found.boxes[:0], found.scalars)
     with pytest.raises(ArgumentError, match="NaN"):
         Glimpses(found.images, found.boxes * np.nan, found.scalars)
+
+
+# -- extents -----------------------------------------------------------------------------------------------------------
+
+
+def see_box(
+    lengths: tuple[float, float, float], middle: tuple[float, float], bottom: float, turn: float
+) -> tuple[Any, Any]:
+    """Mask and depth of a box: width, depth and height in metres, turned by degrees, `bottom` above the floor."""
+    rays = directions((288, 512)).astype(np.float64)
+    cos, sin = np.cos(np.radians(turn)), np.sin(np.radians(turn))
+    rotation = np.array([[cos, 0, sin], [0, 1, 0], [-sin, 0, cos]])
+    centre = np.array([middle[0], bottom + lengths[2] / 2 - CAMERA_HEIGHT, middle[1]])
+    half = np.array([lengths[0], lengths[2], lengths[1]]) / 2
+    with np.errstate(divide="ignore"):
+        ways = ((np.array([-1.0, 1.0])[:, None, None, None] * half) - rotation.T @ -centre) / (rays @ rotation)
+    near, far = ways.min(axis=0).max(axis=-1), ways.max(axis=0).min(axis=-1)
+    mask = (near < far) & (near > 0)
+    return mask, np.where(mask, near, 9.0).astype(np.float32)
+
+
+@settings(max_examples=40, deadline=None)
+@given(
+    st.tuples(st.floats(0.3, 2.0), st.floats(0.3, 2.0), st.floats(0.3, 2.0)),
+    st.floats(0, 0.9),
+    st.floats(0, 360),
+    st.floats(0, 360),
+    st.floats(2.0, 4.0),
+)
+def test_extents_are_those_of_the_visible_part_of_a_box(
+    lengths: tuple[float, float, float], bottom: float, turn: float, bearing: float, away: float
+) -> None:
+    middle = (away * np.sin(np.radians(bearing)), away * np.cos(np.radians(bearing)))
+    longest, across, low, high = measure_extent(*see_box(lengths, middle, bottom, turn))
+    diagonal = np.hypot(*lengths[:2])
+    assert SHORTEST <= across <= longest <= diagonal + 0.02
+    assert longest > 0.6 * min(lengths[:2]), "the whole of the nearer side is in sight"
+    assert bottom - 0.02 <= low < high <= bottom + lengths[2] + 0.02
+    assert high - low > 0.6 * lengths[2]
+
+
+def test_extents_of_a_board_are_its_width_and_heights() -> None:
+    mask, depth = see_box((1.2, 0.002, 0.7), (0.0, -3.0), 0.6, 0.0)
+    longest, across, low, high = measure_extent(mask, depth)
+    assert longest == pytest.approx(0.94 * 1.2, abs=0.04)
+    assert across < 0.02
+    assert (low, high) == (pytest.approx(0.62, abs=0.02), pytest.approx(1.28, abs=0.02))
+
+
+def test_extents_are_unknown_without_depth() -> None:
+    mask, depth = see_box((0.5, 0.5, 0.5), (0.0, -2.0), 0.0, 20.0)
+    panorama = np.zeros((2, *mask.shape, 3), np.uint8)
+    found, _ = extract_glimpses(panorama, np.stack([mask, mask]), np.array([True, False]), [depth, None])
+    np.testing.assert_allclose(found.scalars[0, EXTENT], measure_extent(mask, depth), rtol=1e-6)
+    assert not found.scalars[1, EXTENT].any()
+    holes = np.where(np.arange(512) % 2, depth, 0).astype(np.float32)
+    np.testing.assert_allclose(measure_extent(mask, holes), measure_extent(mask, depth), atol=0.04)
+    for unknown in (np.zeros_like(depth), np.full_like(depth, np.nan)):
+        assert not measure_extent(mask, unknown).any()
 
 
 # -- calibration -------------------------------------------------------------------------------------------------------
@@ -120,12 +198,12 @@ def test_calibration_error_is_the_gap_between_confidence_and_accuracy() -> None:
 torch = pytest.importorskip("torch", reason="needs wiw[torch]")
 
 
-def untrained(width: int = 8) -> Any:
+def untrained(width: int = 8, extents: bool = False) -> Any:
     from wiw.perception.recogniser import Recogniser
     from wiw.perception.recognition_network import Network
 
     torch.manual_seed(1)
-    network = Network(len(NAMES), width)
+    network = Network(len(NAMES), width, extents)
     torch.nn.init.normal_(network.weight.weight)
     return Recogniser(network, NAMES, 1.3, {"accuracy": 0.5})
 
@@ -160,6 +238,21 @@ def test_looks_are_added_with_their_weights() -> None:
     assert np.ptp(weights) > 0.01
 
 
+def test_extents_reach_the_network_where_they_are_known() -> None:
+    from wiw.perception.recognition_network import encode_extents
+
+    scalars = torch.zeros(2, 9)
+    scalars[0, EXTENT] = torch.tensor([1.5, 0.5, 0.1, 0.8])
+    expected = [[1.0, np.log(1.5), np.log(0.5), 0.1, 0.8], [0.0] * 5]
+    np.testing.assert_allclose(encode_extents(scalars).numpy(), expected, rtol=1e-6)
+    looks = noise(1, 4)
+    other = Glimpses(looks.images, looks.boxes, looks.scalars.copy())
+    other.scalars[:, EXTENT] = [0.3, 0.3, 0.0, 0.4]
+    told, by_pictures = untrained(extents=True), untrained()
+    assert np.abs(told([looks]) - told([other])).max() > 1e-4
+    np.testing.assert_array_equal(by_pictures([looks]), by_pictures([other]))
+
+
 def test_the_box_is_drawn_where_it_is() -> None:
     from wiw.perception.recognition_network import to_network_input
 
@@ -177,10 +270,11 @@ def test_the_shipped_size_is_small() -> None:
     assert 100_000 < sum(value.numel() for value in Network(26).parameters()) < 600_000
 
 
-def test_a_saved_recogniser_answers_exactly_as_before(tmp_path: Path) -> None:
+@pytest.mark.parametrize("extents", [False, True])
+def test_a_saved_recogniser_answers_exactly_as_before(tmp_path: Path, extents: bool) -> None:
     from wiw.perception.recogniser import Recogniser
 
-    recogniser, sets = untrained(), [noise(3, 0), noise(2, 7)]
+    recogniser, sets = untrained(extents=extents), [noise(3, 0), noise(2, 7)]
     recogniser.save(tmp_path / "weights.safetensors")
     again = Recogniser.load(tmp_path / "weights.safetensors")
     np.testing.assert_array_equal(again(sets), recogniser(sets))

@@ -206,12 +206,14 @@ def test_no_glimpses_are_not_all_glimpses(options: dict[str, int]) -> None:
         wiw.policy("recogniser", **options)
 
 
-def test_weights_that_come_with_the_package_are_small_and_calibrated() -> None:
+@pytest.mark.parametrize("name", ["pictures", "extents"])
+def test_weights_that_come_with_the_package_are_small_and_calibrated(name: str) -> None:
     from wiw.perception.recogniser import Recogniser
-    from wiw.policies.recogniser.policy import WEIGHTS
+    from wiw.policies.recogniser.policy import SHIPPED
 
-    recogniser = Recogniser.load(WEIGHTS)
-    assert WEIGHTS.stat().st_size < 2 * 2**20
+    recogniser = Recogniser.load(SHIPPED[name])
+    assert recogniser.network.extents == (name == "extents")
+    assert SHIPPED[name].stat().st_size < 2 * 2**20
     assert recogniser.card["accuracy"]["start + 3 real"] > recogniser.card["accuracy"]["start"] > 0.75
     assert recogniser.card["calibration_error"]["after"] < 0.05
 
@@ -219,15 +221,29 @@ def test_weights_that_come_with_the_package_are_small_and_calibrated() -> None:
 @pytest.mark.nightly
 def test_weights_that_come_with_the_package_know_things_of_unseen_homes() -> None:
     from wiw.perception.recogniser import Recogniser
-    from wiw.policies.recogniser.policy import WEIGHTS
+    from wiw.policies.recogniser.policy import SHIPPED
     from wiw.training.glimpse_sets import START, GlimpseSetRules, collect_glimpse_sets
 
-    recogniser = Recogniser.load(WEIGHTS)
+    recogniser = Recogniser.load(SHIPPED["pictures"])
     looks = collect_glimpse_sets(world("apartments:test/900"), 0, recogniser.categories, GlimpseSetRules(places=6))
     first = [looks.glimpses[np.array([row])] for row in np.flatnonzero(looks.kinds == START)]
     right = recogniser(first).argmax(axis=1) == looks.labels
     assert len(right) >= 20
     assert right.mean() > 0.6
+
+
+def test_weights_that_measure_extents_know_things_of_a_house_by_other_hands(data_dir: Path) -> None:
+    from wiw.perception.recogniser import Recogniser
+    from wiw.policies.recogniser.policy import SHIPPED
+    from wiw.training.glimpse_sets import START, GlimpseSetRules, collect_glimpse_sets
+
+    recogniser = Recogniser.load(SHIPPED["extents"])
+    house = world(str(data_dir / "small_house" / "worlds" / "small_house.world"))
+    looks = collect_glimpse_sets(house, 0, recogniser.categories, GlimpseSetRules(places=24, neighbours=0, reshape=1))
+    first = [looks.glimpses[np.array([row])] for row in np.flatnonzero(looks.kinds == START)]
+    right = recogniser(first).argmax(axis=1) == looks.labels
+    assert len(right) >= 100
+    assert right.mean() >= 0.3
 
 
 def test_front_views_are_looked_at_too(two_rooms: str, tmp_path: Path, weights: Path) -> None:
@@ -252,9 +268,9 @@ def test_front_views_are_looked_at_too(two_rooms: str, tmp_path: Path, weights: 
 def test_a_policy_that_only_proposes_is_revised_by_it(
     two_rooms: str, tmp_path: Path, weights: Path, monkeypatch: pytest.MonkeyPatch, model: Any
 ) -> None:
-    from wiw.policies.recogniser.policy import Recognition
+    from wiw.policies.recogniser.policy import SHIPPED, Recognition
 
-    monkeypatch.setattr("wiw.policies.recogniser.policy.WEIGHTS", weights)
+    monkeypatch.setitem(SHIPPED, "pictures", weights)
     task = AR(episode_file=a_file(tmp_path, two_rooms), decisions=2)
     agent = wiw.Agent("heuristic", model)
     assert isinstance(agent_for(task, agent).reviser, Recognition)

@@ -64,7 +64,7 @@ def made_up(sets: int, seed: int) -> GlimpseSets:
     count = sets * len(KINDS)
     boxes = np.tile(np.array([0.2, 0.2, 0.8, 0.8], np.float32), (count, 2, 1))
     kinds = np.tile(KINDS, sets)
-    scalars = np.column_stack([np.zeros((count, 4)), kinds == START]).astype(np.float32)
+    scalars = np.column_stack([np.zeros((count, 4)), kinds == START, np.zeros((count, 4))]).astype(np.float32)
     return GlimpseSets(Glimpses(images, boxes, scalars), np.repeat(np.arange(sets), len(KINDS)), kinds, labels)
 
 
@@ -73,7 +73,7 @@ def lesson() -> Any:
     from wiw.training.recogniser import Recipe, calibrate, train
 
     recipe = Recipe(
-        epochs=7, batch=24, width=8, seed=3, recolor=0, transplant=0, degrade=0
+        epochs=7, batch=24, width=8, seed=3, recolor=0, transplant=0, degrade=0, swap=0
     )  # here colour tells what misleads
     network, used = train(made_up(240, 0), NAMES, recipe)
     assert used == recipe
@@ -156,13 +156,9 @@ def test_training_goes_on_from_a_network() -> None:
     again = train(looks, NAMES, replace(recipe, seed=1), start=first)[0]
     assert torch.equal(first.logits.weight, again.logits.weight)
     assert not torch.equal(first.logits.weight, train(looks, NAMES, replace(recipe, seed=1))[0].logits.weight)
-    plain = train(looks, NAMES, replace(recipe, sizes=False))[0]
-    told = train(looks, NAMES, recipe, start=plain)[0]
-    assert torch.equal(told.mix[0].weight[:, :-3], plain.mix[0].weight) and not told.mix[0].weight[:, -3:].any()
-    with pytest.raises(ArgumentError, match="sizes=True"):
-        train(looks, NAMES, replace(recipe, sizes=False), start=told)
-    with pytest.raises(ArgumentError, match="expected a start of 3 categories and width 8, got 3 and 4"):
-        train(looks, NAMES, Recipe(width=8), start=first)
+    for other in ({"width": 8}, {"extents": False}):
+        with pytest.raises(ArgumentError, match=r"expected a start of 3 categories.*, got 3, 4 and True"):
+            train(looks, NAMES, replace(recipe, **other), start=first)
 
 
 def test_sizes_are_those_of_things_on_the_floor() -> None:
@@ -170,11 +166,63 @@ def test_sizes_are_those_of_things_on_the_floor() -> None:
 
     distance, width, height = np.array([1.2, 3.0, 5.0]), np.array([0.5, 2.0, 1.2]), np.array([0.4, 0.9, 2.1])
     angles = [2 * np.arctan(width / 2 / distance), np.zeros(3), np.arctan((height - 1) / distance)]
-    scalars = np.column_stack([*angles, -np.arctan(1 / distance), np.ones(3)]).astype(np.float32)
+    scalars = np.column_stack([*angles, -np.arctan(1 / distance), np.ones(3), np.zeros((3, 4))]).astype(np.float32)
     expected = np.column_stack([np.log(distance), np.log(width), height])
     np.testing.assert_allclose(estimate_sizes(torch.from_numpy(scalars)).numpy(), expected, rtol=1e-4, atol=1e-4)
     above = torch.tensor([[0.2, 0.2, 0.3, 0.1, 1.0], [0.0, 0.0, 1.5, -1.57, 0.0]])  # no floor below; right below
+    above = torch.nn.functional.pad(above, (0, 4))
     assert estimate_sizes(above).isfinite().all()
+
+
+def test_extents_vary_by_set_and_are_sometimes_unknown() -> None:
+    from wiw.training.recogniser import Recipe, _augment
+
+    looks = made_up(60, 3)
+    looks.glimpses.scalars[looks.kinds == START, 5:] = [1.0, 0.5, 0.2, 0.9]
+    rows, recipe = np.flatnonzero(looks.kinds == START), Recipe(resize=1.25, unmeasured=0.5)
+    again = np.repeat(rows, 2), np.repeat(np.arange(60), 2)
+    found = _augment(looks, *again, recipe, np.random.default_rng(0))[1].numpy()[:, 5:].reshape(60, 2, 4)
+    known = found[:, :, 0] > 0
+    assert (known[:, 0] == known[:, 1]).all() and 15 < known[:, 0].sum() < 45
+    assert not found[~known].any()
+    factors = found[known[:, 0]] / [1.0, 0.5, 0.2, 0.9]
+    assert factors.min() > 0.75 and factors.max() < 1.32 and np.ptp(factors[:, 0, 0]) > 0.2
+    assert np.abs(factors[:, 0] / factors[:, 1] - 1).max() < 0.09, "views of one object agree but for noise"
+    assert np.abs(factors[..., 2] / factors[..., 3] - 1).max() < 0.09, "both heights grow alike"
+
+
+def test_extents_are_learned_where_pictures_say_nothing() -> None:
+    from wiw.training.recogniser import Recipe, compute_set_logits, select_rows, train
+
+    def grey(seed: int) -> GlimpseSets:
+        looks = made_up(120, seed)
+        looks.glimpses.images[:] = 110
+        lengths = np.array([0.3, 1.0, 3.0])[looks.labels][looks.owners]
+        looks.glimpses.scalars[looks.kinds == START, 5:] = np.column_stack(
+            [lengths, lengths / 2, 0 * lengths, lengths]
+        )[looks.kinds == START]
+        return looks
+
+    recipe, held_out = Recipe(epochs=20, batch=24, width=8), grey(1)
+    network = train(grey(0), NAMES, recipe)[0]
+    found = compute_set_logits(network, held_out, select_rows(held_out, START, 0)).argmax(axis=1)
+    assert (found == held_out.labels).mean() > 0.8
+
+
+def test_pictures_of_a_share_of_glimpses_are_of_something_else() -> None:
+    from wiw.training.recogniser import Recipe, _augment
+
+    looks = made_up(60, 3)
+    looks.glimpses.images[:] = looks.labels[looks.owners][:, None, None, None, None] * 80
+    rows = np.flatnonzero(looks.kinds == START)
+    still = {"recolor": 0.0, "transplant": 0.0, "degrade": 0.0}
+    order = np.arange(60)
+    shown = [_augment(looks, rows, order, Recipe(swap=swap, **still), np.random.default_rng(0))[0] for swap in (0, 1)]
+    grey = np.array([[image[:3].mean().item() for image in images] for images in shown])
+    means = [grey[0, looks.labels == label].mean() for label in range(3)]
+    assert means[0] < means[1] < means[2]
+    nearest = np.abs(grey[1][:, None] - means).argmin(axis=1)
+    assert 0.2 < (nearest == looks.labels).mean() < 0.7, "by chance alone"
 
 
 def test_batches_are_pairs_of_categories_that_are_confused() -> None:

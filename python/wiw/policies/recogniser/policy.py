@@ -23,7 +23,8 @@ from wiw.policies.recogniser import steering
 from wiw.registry import TRACKERS
 from wiw.types import Answer, Goal, Key, Proposal, Rollout
 
-WEIGHTS = Path(__file__).parent / "weights.safetensors"
+SHIPPED = {name: Path(__file__).parent / f"{name}.safetensors" for name in ("pictures", "extents")}
+"""Weights that come with the package: one recogniser that goes by pictures alone, and one that is also told sizes."""
 SAME_PLACE = 0.05
 """Places closer together than this, in metres, count as the same."""
 
@@ -49,7 +50,9 @@ class Recognition(Policy):
     of the answer with the plan's imagined glimpses. Frames that lose the target count against a plan.
 
     Args:
-        weights: of `wiw.perception.recogniser.Recogniser`; None means those shipped with the package.
+        weights: file of a `wiw.perception.recogniser.Recogniser`, or the name of one of those shipped: "pictures", or
+            "extents", which measures the target by depth and knows furniture by other makers better, but gains less
+            from imagination (docs/results.md).
         tracker: name of the tracker that locates the target in imagined frames, or an instance.
         tracker_options: what a tracker given by name is made with.
         remember: number of real glimpses stored, from as many places.
@@ -82,7 +85,7 @@ class Recognition(Policy):
 
     def __init__(
         self,
-        weights: str | Path | None = None,
+        weights: str | Path = "pictures",
         tracker: Any = "reprojection",
         tracker_options: Mapping[str, Any] | None = None,
         remember: int = 2,
@@ -95,7 +98,7 @@ class Recognition(Policy):
             raise ArgumentError(
                 f"policy recogniser: expected remember and views of at least 1, got {remember} and {views}"
             )
-        self.file = Path(WEIGHTS if weights is None else weights)
+        self.file = Path(SHIPPED.get(str(weights), weights))
         self.recogniser = Recogniser.load(self.file)
         self.tracker = TRACKERS.make(tracker, **(tracker_options or {}))
         self.needs = tuple(sorted({"depth", *self.tracker.needs}))
@@ -122,8 +125,9 @@ class Recognition(Policy):
         """Store a real glimpse where the target is in sight; one per place, the latest."""
         for situation in situations:
             observation, memory = situation.observation, situation.memory
+            depth = observation.depth if self.recogniser.network.extents else None
             found, _ = extract_glimpses(
-                observation.panorama[None], get_target(observation).mask[None], np.ones(1, bool)
+                observation.panorama[None], get_target(observation).mask[None], np.ones(1, bool), [depth]
             )
             if not len(found):
                 continue

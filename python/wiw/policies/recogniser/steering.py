@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 
 from wiw.action import FORWARD, TURN_LEFT, TURN_RIGHT, ActionSpace
 from wiw.perception.boxes import Mask, box_width, find_box
+from wiw.perception.glimpses import CAMERA_HEIGHT
 from wiw.types import Observation
 
 TURN = ActionSpace().turn_rad
@@ -23,7 +24,6 @@ DETOUR_ANGLE = 2 * TURN
 """Angle between a detour and the direction of the target."""
 OBSTACLE_HEIGHTS = (0.15, 1.0)
 """Heights above the floor, in metres, between which surfaces are obstacles; the camera is at 1 m."""
-CAMERA_HEIGHT = 1.0
 MIN_CLEARANCE = 0.45
 """Metres that a heading must be free."""
 
