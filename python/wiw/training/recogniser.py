@@ -72,8 +72,8 @@ class Recipe:
     unmeasured: float = 0.25
     """Share of sets whose extents are unknown."""
     swap: float = 0.3
-    """Share of glimpses whose picture is of something else, so that measured extents also count where furniture looks
-    unlike any that was trained on."""
+    """With extents: share of glimpses whose picture is of something else, so that extents also count where furniture
+    looks unlike any that was trained on."""
     seed: int = 0
 
     def __post_init__(self) -> None:
@@ -268,7 +268,8 @@ def _augment(
 
     All glimpses of a set are recoloured alike, as they show one object; what degrades a picture is each one's own.
     """
-    pictured = np.where(rng.random(len(rows)) < recipe.swap, rng.permutation(rows), rows)
+    swapped = rng.random(len(rows)) < recipe.swap * recipe.extents
+    pictured = np.where(swapped, rng.permutation(rows), rows)
     found = replace(data.glimpses[pictured], scalars=data.glimpses.scalars[rows])
     extent = found.boxes[..., 2:] - found.boxes[..., :2]
     off = rng.uniform(-0.04, 0.04, (len(rows), 1, 4)) * np.concatenate([extent, extent], axis=-1)
