@@ -20,7 +20,7 @@ from wiw.action import FORWARD, TURN_LEFT, TURN_RIGHT
 from wiw.datasets.cameras import camera_pose
 from wiw.datasets.visibility import visible_fraction
 from wiw.datasets.worlds import world
-from wiw.errors import ArgumentError
+from wiw.errors import ArgumentError, FileError
 from wiw.loop.scheduler import run_episodes
 from wiw.policies.recogniser import steering
 from wiw.tasks.ar import AR
@@ -204,6 +204,13 @@ def test_turns_and_the_order_of_steering_cost_a_plan(two_rooms: str, tmp_path: P
 def test_no_glimpses_are_not_all_glimpses(options: dict[str, int]) -> None:
     with pytest.raises(ArgumentError, match="expected remember and views of at least 1"):
         wiw.policy("recogniser", **options)
+
+
+def test_weights_are_named_or_files(tmp_path: Path) -> None:
+    with pytest.raises(ArgumentError, match=r"expected weights pictures or extents, or a file .*, got 'extent'"):
+        wiw.policy("recogniser", weights="extent")
+    with pytest.raises(FileError, match=r"nowhere\.safetensors"):
+        wiw.policy("recogniser", weights=tmp_path / "nowhere.safetensors")
 
 
 @pytest.mark.parametrize("name", ["pictures", "extents"])

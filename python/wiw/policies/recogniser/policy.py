@@ -63,7 +63,7 @@ class Recognition(Policy):
         trust: deduction for each rank in the order of proposals, which is all that counts without a world model.
 
     Raises:
-        ArgumentError: no glimpses to remember or to view.
+        ArgumentError: no glimpses to remember or to view, or weights that are neither a name nor a file.
         DependencyError: torch or safetensors is not installed.
         FileError: the weights cannot be read.
     """
@@ -98,7 +98,7 @@ class Recognition(Policy):
             raise ArgumentError(
                 f"policy recogniser: expected remember and views of at least 1, got {remember} and {views}"
             )
-        self.file = Path(SHIPPED.get(str(weights), weights))
+        self.file = _find_weights(weights)
         self.recogniser = Recogniser.load(self.file)
         self.tracker = TRACKERS.make(tracker, **(tracker_options or {}))
         self.needs = tuple(sorted({"depth", *self.tracker.needs}))
@@ -213,6 +213,17 @@ class Recognition(Policy):
                 _embed_front_views(masks[..., None].astype(np.uint8))[..., 0] > 0,
             )
         return extract_glimpses(frames, masks, np.zeros(len(wanted), bool))[0]
+
+
+def _find_weights(weights: str | Path) -> Path:
+    """Return the file of weights given by path or by the name of shipped ones."""
+    file = SHIPPED.get(str(weights), Path(weights))
+    if not file.suffix and not file.exists():
+        raise ArgumentError(
+            f"policy recogniser: expected weights {' or '.join(SHIPPED)}, or a file of `wiw train recogniser`, got "
+            f"'{weights}'"
+        )
+    return file
 
 
 def _get_real_glimpses(situation: Situation) -> list[Glimpses]:
