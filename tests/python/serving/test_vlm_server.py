@@ -343,7 +343,8 @@ def test_answers_that_arrived_beside_a_failure_are_kept(tmp_path: Path) -> None:
 def test_an_interrupted_client_neither_waits_nor_asks_again(fault: str) -> None:
     """Ctrl-C in a process that asks a server which is slow, or asks for a pause of half a minute."""
     asking = (
-        "import sys; from wiw.vlm import Request, connect, user\n"
+        "import signal, sys; from wiw.vlm import Request, connect, user\n"
+        "signal.signal(signal.SIGINT, signal.default_int_handler)\n"  # shells start background jobs without one
         "client = connect(sys.argv[1], model='mock', concurrency=2)\n"
         "client.ask([Request((user(f'Say {k}'),)) for k in range(6)])\n"
     )
