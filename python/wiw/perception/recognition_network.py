@@ -12,7 +12,7 @@ from wiw.perception.glimpses import CAMERA_HEIGHT, EXTENT, SHORTEST, SIDE
 
 CHANNELS = 8
 """Colour and box of the close and of the wide view."""
-ANGLES = 5
+ANGLES = EXTENT.start
 """Columns of `Glimpses.scalars` before those of the extent."""
 FARTHEST = 8.0
 """Metres beyond which a distance is not estimated."""

@@ -35,9 +35,9 @@ from wiw.world_models.base import WorldModel, find_accepts
 PLACEBO, PLACEBO_MODEL = "placebo-", "warp"
 """Beginning of the names of placebo arms, and the model that they use where nobody names one."""
 RESEEDED = "reseeded"
+"""Begins arms that repeat another with other random numbers: the noise floor."""
 CHANGES = ("placebo", "error", "reseed")
 """Settings of an agent that make it a control: they change what is done with its world model."""
-"""Begins arms that repeat another with other random numbers: the noise floor."""
 ERROR, ERROR_MODEL = "error-", "oracle"
 """Beginning of the names of arms with an error, and the model that they use where nobody names one."""
 REFERENCES = ("none", "copy", "oracle")

@@ -156,8 +156,8 @@ def train(
     expected = (len(categories), recipe.width, recipe.extents)
     if start is not None and (start.categories, start.width, start.extents) != expected:
         raise ArgumentError(
-            "recogniser: expected a start of {} categories, width {} and extents {}".format(*expected)
-            + f", got {start.categories}, {start.width} and {start.extents}"
+            f"recogniser: expected a start of {len(categories)} categories, width {recipe.width} and extents "
+            f"{recipe.extents}, got {start.categories}, {start.width} and {start.extents}"
         )
     steps_per_epoch = max(1, len(data) // recipe.batch)
     trainer, recipe = run_training(

@@ -156,9 +156,10 @@ def test_training_goes_on_from_a_network() -> None:
     again = train(looks, NAMES, replace(recipe, seed=1), start=first)[0]
     assert torch.equal(first.logits.weight, again.logits.weight)
     assert not torch.equal(first.logits.weight, train(looks, NAMES, replace(recipe, seed=1))[0].logits.weight)
-    for other in ({"width": 8}, {"extents": False}):
-        with pytest.raises(ArgumentError, match=r"expected a start of 3 categories.*, got 3, 4 and True"):
-            train(looks, NAMES, replace(recipe, **other), start=first)
+    with pytest.raises(ArgumentError, match="expected a start of 3 categories, width 8 and extents True, got 3, 4 and"):
+        train(looks, NAMES, replace(recipe, width=8), start=first)
+    with pytest.raises(ArgumentError, match="3 categories, width 4 and extents False, got 3, 4 and True"):
+        train(looks, NAMES, replace(recipe, extents=False), start=first)
 
 
 def test_sizes_are_those_of_things_on_the_floor() -> None:
