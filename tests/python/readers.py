@@ -5,11 +5,15 @@ from __future__ import annotations
 
 import gzip
 import json
+import math
 import random
+import re
 import shutil
 import socket
+import sqlite3
 import struct
 from collections.abc import Callable
+from contextlib import closing, suppress
 from dataclasses import dataclass
 from pathlib import Path
 from tempfile import TemporaryDirectory
@@ -38,7 +42,7 @@ class Reader:
     make_sample: Callable[[Path], bytes]
     read: Read
     structure: str = ""
-    """The format in which values may be exchanged with the whole still well-formed: json, yaml, msgpack or glb."""
+    """The format in which values may be exchanged with the whole still well-formed; see `STRUCTURES`."""
     refusals: tuple[type[BaseException], ...] = ()
     """Errors beyond wiw's own that its caller expects."""
 
@@ -85,11 +89,56 @@ def damage_glb(data: bytes, draw: random.Random) -> bytes:
     return struct.pack("<4sII", b"glTF", 2, 12 + len(chunks)) + chunks
 
 
+def damage_sqlite(data: bytes, draw: random.Random) -> bytes:
+    """Change the values of a column, the text of a table's schema, or the number of the schema."""
+    modes = data[18:20]  # a database in memory has no log
+    with closing(sqlite3.connect(":memory:")) as connection:
+        connection.deserialize(data[:18] + b"\1\1" + data[20:])
+        tables = connection.execute("SELECT name, sql FROM sqlite_master WHERE type = 'table'").fetchall()
+        for _ in range(draw.randrange(1, 4)):
+            table, text = draw.choice(tables)
+            kind = draw.random()
+            if kind < 0.4:
+                change_column(connection, table, draw)
+            elif kind < 0.8:
+                connection.execute("PRAGMA writable_schema = ON")
+                changed = damage_words(text, draw)
+                connection.execute("UPDATE sqlite_master SET sql = ? WHERE name = ?", (changed, table))
+            else:
+                connection.execute(f"PRAGMA user_version = {draw.randrange(-1, 14)}")
+        connection.commit()
+        changed = connection.serialize()
+    return changed[:18] + modes + changed[20:]
+
+
+def change_column(connection: sqlite3.Connection, table: str, draw: random.Random) -> None:
+    from test_episode_files_mutated import as_json, change_value
+
+    column = draw.choice([row[1] for row in connection.execute(f"PRAGMA table_info({table})")])
+    values = [value for (value,) in connection.execute(f"SELECT {column} FROM {table}")]
+    other = draw.choice((None, -1, 2**62, 0.5, math.inf, "", "x", b"\xff", "done"))
+    if values and isinstance(values[0], str) and values[0][:1] in ("{", "[") and draw.random() < 0.8:
+        with suppress(ValueError, RecursionError):  # damaged before
+            other = as_json(change_value(json.loads(draw.choice(values)), draw)).decode()
+    connection.execute("PRAGMA ignore_check_constraints = ON")
+    with suppress(sqlite3.IntegrityError):  # a key cannot be text
+        connection.execute(f"UPDATE OR IGNORE {table} SET {column} = ?", (other,))
+
+
+def damage_words(text: str, draw: random.Random) -> str:
+    """Remove, double or replace a word, or change a letter."""
+    words = re.findall(r"\w+|\W+", text)
+    at = draw.randrange(2, len(words))
+    words[at] = draw.choice(("", words[at] * 2, draw.choice(words), words[at][:-1] + chr(draw.randrange(1, 300))))
+    return "".join(words)
+
+
 STRUCTURES: dict[str, Mutate] = {
     "json": damage_json,
     "yaml": damage_yaml,
     "msgpack": damage_msgpack,
     "glb": damage_glb,
+    "sqlite": damage_sqlite,
 }
 
 
@@ -182,7 +231,9 @@ def read_store(path: Path) -> Any:
     try:
         store = log.store
         keys = [(row["arm"], row["episode"], row["decision"]) for row in store.decisions()]
-        return store.outcomes(), store.episodes(), store.info, store.judges, [store.images(*key) for key in keys]
+        pictures = [store.images(*key) for key in keys]
+        tables = log.numbers(), log.costs(), log.fidelity(), log.blame(), log.breakdown("anytime")
+        return store.outcomes(), store.episodes(), store.info, store.judges, pictures, tables
     finally:
         log.close()
 
@@ -335,7 +386,7 @@ READERS: dict[str, Reader] = {
     "link stl": Reader(make_stl, from_file("m.stl", read_link)),
     "navmesh": Reader(write_and_take("m.navmesh", make_navmesh), from_file("m.navmesh", read_navmesh)),
     "scene cache": Reader(write_and_take("m.wiwscene", make_scene_cache), from_file("m.wiwscene", read_scene_cache)),
-    "store": Reader(write_and_take("run.sqlite", make_store), from_file("run.sqlite", read_store)),
+    "store": Reader(write_and_take("run.sqlite", make_store), from_file("run.sqlite", read_store), "sqlite"),
     "episodes": Reader(write_and_take("e.json", make_episodes), from_file("e.json", read_episodes), "json"),
     "questions": Reader(write_and_take("q.json", make_questions), from_file("q.json", read_questions), "json"),
     "preset": Reader(take_config("default/imagenav.yaml"), from_file("p.yaml", read_preset), "yaml"),

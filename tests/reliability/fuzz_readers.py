@@ -3,7 +3,7 @@
 -runs=1000000 or -max_total_time=300]. Needs `pip install atheris`; without arguments it lists the readers.
 
 libFuzzer prints coverage (`cov`), and writes what fails to crash-*; a failure belongs into a test. Damage within the
-structure of msgpack, JSON, YAML and GLB takes turns with libFuzzer's own.
+structure of msgpack, JSON, YAML, GLB and SQLite takes turns with libFuzzer's own.
 """
 
 from __future__ import annotations

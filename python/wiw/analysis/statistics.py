@@ -173,7 +173,7 @@ def compare(
     ours, theirs = ([outcomes[name][i]["metrics"][metric.name] for i in both] for name in (arm, base))
     scenes = [outcomes[arm][i]["scene"] for i in both]
     sign = 1 if metric.higher_is_better else -1
-    gains = sign * (np.asarray(ours) - np.asarray(theirs))
+    gains = sign * _subtract(ours, theirs, metric)[0]
     return Difference(
         arm,
         base,

@@ -374,7 +374,8 @@ def _list_trackers(run: Run) -> dict[str, str]:
     built = run.store.info.get("built", {})
     revisers = [built[arm].get("revision") for arm in run.arms if arm in built and built[arm].get("model")]
     trackers = [reviser.get("tracker") for reviser in revisers if isinstance(reviser, Mapping)]
-    return {own["name"]: own["follows"] for own in trackers if isinstance(own, Mapping)}
+    known = [own for own in trackers if isinstance(own, Mapping) and {"name", "follows"} <= own.keys()]
+    return {str(own["name"]): str(own["follows"]) for own in known}
 
 
 def count_unbalanced(run: Run) -> int:

@@ -95,7 +95,7 @@ def describe_departures(task: Task, agents: Mapping[str, Any], episodes: int) ->
 
 def read_departures(manifest: Mapping[str, Any]) -> tuple[Departure, ...]:
     """Return the departures that a run's manifest names; none for a run from before they were recorded."""
-    return tuple(Departure(**each) for each in manifest.get("departures", ()))
+    return tuple(Departure(each["topic"], each["found"], each["reason"]) for each in manifest.get("departures", ()))
 
 
 def _load_protocol(task: Task, recipes: list[AgentRecipe]) -> Preset:

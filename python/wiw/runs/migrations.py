@@ -54,6 +54,11 @@ _WRAPPED_STAGES = {"scoring": "revision", "proposals": "policy"}
 """Stages given the ground truth, and the part of a built agent that says so since version 9."""
 
 
+def is_newer(table: str, column: str, version: int) -> bool:
+    """Return whether a column was added after schema `version`, which is at least `OLDEST_READABLE`."""
+    return (version < 11 and table in _TABLES_OF_11) or (version < 10 and (table, column) == ("outcome", "details"))
+
+
 def migrate(connection: sqlite3.Connection, version: int) -> None:
     """Rewrite the tables of a store with schema `version`, inside the caller's transaction."""
     if version < 10:

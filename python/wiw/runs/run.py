@@ -4,6 +4,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
+from dataclasses import fields
 from pathlib import Path
 from typing import Any
 
@@ -66,7 +67,8 @@ class Run:
         """Return what the task's tables and plots show; for older runs, what the task says now."""
         kept, task = self.store.info.get("tables"), self.store.config["task"].get("task")
         if kept is not None:
-            values: dict[str, Any] = {str(name): tuple(v) if isinstance(v, list) else v for name, v in kept.items()}
+            known = {each.name: kept[each.name] for each in fields(TableSpec) if each.name in kept}
+            values: dict[str, Any] = {name: tuple(v) if isinstance(v, list) else v for name, v in known.items()}
             return TableSpec(**values)
         return TableSpec() if task not in TASKS.names() else task_class(task).tables
 

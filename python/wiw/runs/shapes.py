@@ -11,11 +11,14 @@ from typing import Any
 from wiw.errors import StoreError
 from wiw.json_text import parse_json
 
+EDITED = "the run store was edited: restore it from a backup"
+"""Ends messages about values that no version of wiw writes."""
 NUMBER = (int, float, type(None))
 """A number, or null for one that is not finite."""
 TEXT, FLAG = (str,), (bool,)
 WHOLE = (int,)
 NONE = (type(None),)
+FINITE = (int, float)
 NUMBERS = {str: (*NUMBER, bool)}
 """Names to numbers."""
 
@@ -23,8 +26,8 @@ NUMBERS = {str: (*NUMBER, bool)}
 class Either:
     """One of several shapes.
 
-    A shape is a tuple of types, [shape of each item], {str: shape of each value}, {name: shape, ...} with the names
-    that must be there, or this.
+    A shape is a tuple of types, [shape of each item], {name: shape, ..., str: shape of all other values} with the names
+    that must be there ("name?": that may be), or this.
     """
 
     def __init__(self, *shapes: Any) -> None:
@@ -44,6 +47,13 @@ INFO: Any = {
     "live": WHOLE,
     "workers": WHOLE,
     "limits": {},
+    "benchmark?": WHOLE,
+    "salt?": TEXT,
+    "shard?": (str, type(None)),
+    "stopped?": {"episodes": WHOLE},
+    "built?": {str: {}},
+    "departures?": [{"topic": TEXT, "found": TEXT, "reason": TEXT}],
+    "tables?": {"kinds?": [TEXT], "judged?": [TEXT], "cuts?": [WHOLE], "kind?": TEXT},
 }
 ACTIONS = [Either((int, float), [NUMBER])]
 """A number or a vector for each action."""
@@ -52,7 +62,7 @@ COLUMNS: Mapping[str, Any] = {
     "info": INFO,
     "episode.info": {},
     "description": {"judge": TEXT},
-    "metrics": NUMBERS,
+    "metrics": {"success?": FINITE, "decisions?": FINITE, **NUMBERS},
     "details": {},
     "world_to_pixel": [[NUMBER]],
     "actions": ACTIONS,
@@ -91,7 +101,7 @@ def parse_column(column: str, text: Any, where: str) -> Any:
     try:
         return _read_column(column, text)
     except ValueError as error:
-        raise StoreError(f"{where}: {error}; the run store was edited: restore it from a backup") from error
+        raise StoreError(f"{where}: {error}; {EDITED}") from error
 
 
 def _read_column(column: str, text: Any) -> Any:
@@ -135,8 +145,7 @@ def check_types(row: Mapping[str, Any], declared: Mapping[str, tuple[type, ...]]
     for name, value in row.items():
         if name in declared and not isinstance(value, declared[name]):
             raise StoreError(
-                f"{where}: {name}: expected {declared[name][0].__name__}, got {type(value).__name__}; the run store "
-                "was edited: restore it from a backup"
+                f"{where}: {name}: expected {declared[name][0].__name__}, got {type(value).__name__}; {EDITED}"
             )
 
 
@@ -149,7 +158,7 @@ def check_decision(row: Mapping[str, Any], where: str) -> None:
     try:
         _require_agreement(row)
     except ValueError as error:
-        raise StoreError(f"{where}: {error}; the run store was edited: restore it from a backup") from error
+        raise StoreError(f"{where}: {error}; {EDITED}") from error
 
 
 def _require_agreement(row: Mapping[str, Any]) -> None:
@@ -178,14 +187,18 @@ def _check(value: Any, shape: Any, place: str) -> None:
             _check(item, shape[0], f"{place}[{index}]")
     else:
         _require(value, dict, place)
-        if str in shape:
-            for name, item in value.items():
-                _check(item, shape[str], f"{place}.{name}".lstrip("."))
-            return
-        for name, inner in shape.items():
-            if name not in value:
-                raise ValueError(f"{place or 'value'}: '{name}' is missing")
-            _check(value[name], inner, f"{place}.{name}".lstrip("."))
+        _check_names(value, shape, place)
+
+
+def _check_names(value: Mapping[str, Any], shape: Mapping[Any, Any], place: str) -> None:
+    named = {name.rstrip("?"): inner for name, inner in shape.items() if name is not str}
+    for name in named:
+        if name in shape and name not in value:
+            raise ValueError(f"{place or 'value'}: '{name}' is missing")
+    for name, item in value.items():
+        inner = named.get(name, shape.get(str))
+        if inner is not None:
+            _check(item, inner, f"{place}.{name}".lstrip("."))
 
 
 def _check_either(value: Any, either: Either, place: str) -> None:

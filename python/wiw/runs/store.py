@@ -24,11 +24,11 @@ from wiw.file_systems import find_network
 from wiw.runs import configurations
 from wiw.runs.faults import explain_faults, find_remedy
 from wiw.runs.judges import JudgedRow, JudgeRecord, apply_judge, find_judge
-from wiw.runs.migrations import OLDEST_READABLE, migrate, show_as_current
+from wiw.runs.migrations import OLDEST_READABLE, is_newer, migrate, show_as_current
 from wiw.runs.processes import describe_process
 from wiw.runs.rows import AgentRow, DecisionRow, LostRow, OutcomeRow, build_episode, to_episode_values, to_json
 from wiw.runs.scratch import ScratchCopy
-from wiw.runs.shapes import check_decision, check_types, parse_column
+from wiw.runs.shapes import EDITED, check_decision, check_types, parse_column
 from wiw.runs.shards import Shard
 from wiw.runs.store_file import (
     FILE_NAME,
@@ -296,19 +296,18 @@ class RunStore:
                 f"{wiw.__version__}, which reads versions {OLDEST_READABLE} to {SCHEMA_VERSION}: use the one that "
                 "wrote it, or start a new run"
             )
-        if version == SCHEMA_VERSION:
-            self._require_columns()
+        self._require_columns(version)
 
-    def _require_columns(self) -> None:
-        """Check that the tables have the columns that this version writes: a damaged schema may still be SQL."""
+    def _require_columns(self, version: int) -> None:
+        """Check that the tables have the columns of schema `version`: a damaged schema may still be SQL."""
         for table, columns in list_columns().items():
             found = {row["name"]: row["type"] for row in self._rows(f"PRAGMA main.table_info({table})")}
-            if not columns.items() <= found.items():
-                wrong = next(name for name in columns if found.get(name) != columns[name])
-                raise StoreError(
-                    f"{self.path}: table {table}: expected a column {wrong} {columns[wrong]}, got "
-                    f"{found.get(wrong, 'none')}; {find_remedy(self.path, 'malformed')}"
-                )
+            for name, column in columns.items():
+                if found.get(name) != column.kind and not is_newer(table, name, version):
+                    raise StoreError(
+                        f"{self.path}: table {table}: expected a column {name} {column.kind}, got "
+                        f"{found.get(name, 'none')}; {find_remedy(self.path, 'malformed')}"
+                    )
 
     def _update_schema(self) -> None:
         """Bring an older store to the current schema: in the file if it may be written, else for this reader alone."""
@@ -423,6 +422,11 @@ class RunStore:
             "ORDER BY arm, episode"
         )
         rows = self._convert_types("outcome", rows)
+        arms = [arm["name"] for arm in self.config["arms"]]
+        for row in rows:
+            if row["arm"] not in arms:
+                place = self._place("outcome", row)
+                raise StoreError(f"{place}: expected an arm of the run: {', '.join(arms)}; {EDITED}")
         named = [row if row["task"] else {name: row[name] for name in row if name != "task"} for row in rows]
         return [
             {**row, **{name: parse_column(name, row[name], self._place("outcome", row)) for name in OUTCOME_JSON}}
@@ -794,11 +798,7 @@ class RunStore:
         Raises:
             StoreError: a value is of another type.
         """
-        columns = self._rows(f"PRAGMA main.table_info({table})")
-        declared = {
-            column["name"]: _TYPES[column["type"]] + (() if column["notnull"] or column["pk"] else (type(None),))
-            for column in columns
-        }
+        declared = {name: column.types for name, column in list_columns()[table].items()}
         for row in rows:
             check_types(row, declared, self._place(table, row))
         return rows
@@ -809,8 +809,8 @@ class RunStore:
 
     def _read_column(self, column: str) -> Any:
         rows = self._rows("SELECT * FROM run")
-        if not rows:
-            raise StoreError(f"{self.path} is damaged: it does not say which run it holds")
+        if not rows or column not in rows[0]:
+            raise StoreError(f"{self.path} does not say which run it holds; {find_remedy(self.path, 'malformed')}")
         return rows[0][column]
 
 
@@ -874,7 +874,3 @@ def _forget(connection: sqlite3.Connection, condition: str, values: tuple[Any, .
         )
     for table in ("decision", "image", "film"):
         connection.execute(f"DELETE FROM {table} AS d WHERE {condition}", values)
-
-
-_TYPES: dict[str, tuple[type, ...]] = {"TEXT": (str,), "INTEGER": (int,), "REAL": (float, int), "BLOB": (bytes,)}
-"""Python types by SQLite's names."""

@@ -6,10 +6,11 @@ from __future__ import annotations
 import fcntl
 import os
 import sqlite3
+from collections.abc import Iterator
 from contextlib import ExitStack, closing, suppress
 from functools import cache
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 from wiw.errors import StoreError
 from wiw.file_systems import find_network
@@ -18,6 +19,8 @@ from wiw.runs.scratch import ScratchCopy
 
 FILE_NAME = "run.sqlite"
 SCHEMA = Path(__file__).with_name("schema.sql")
+_TYPES: dict[str, tuple[type, ...]] = {"TEXT": (str,), "INTEGER": (int,), "REAL": (float, int), "BLOB": (bytes,)}
+"""Python types by SQLite's names."""
 
 
 def store_path(run: str | Path) -> Path:
@@ -26,15 +29,27 @@ def store_path(run: str | Path) -> Path:
     return path if path.suffix == ".sqlite" else path / FILE_NAME
 
 
+class Column(NamedTuple):
+    """A column as the schema declares it."""
+
+    kind: str
+    """SQLite's name of the type."""
+    types: tuple[type, ...]
+    """Python types of its values."""
+
+
 @cache
-def list_columns() -> dict[str, dict[str, str]]:
-    """Return the columns of each table of a store, with the types that its schema names."""
+def list_columns() -> dict[str, dict[str, Column]]:
+    """Return the columns of each table of a store by name, as its schema declares them."""
     with closing(sqlite3.connect(":memory:")) as connection:
         connection.executescript(SCHEMA.read_text())
         tables = [name for (name,) in connection.execute("SELECT name FROM sqlite_master WHERE type = 'table'")]
-        return {
-            table: {row[1]: row[2] for row in connection.execute(f"PRAGMA table_info({table})")} for table in tables
-        }
+        return {table: dict(_read_columns(connection, table)) for table in tables}
+
+
+def _read_columns(connection: sqlite3.Connection, table: str) -> Iterator[tuple[str, Column]]:
+    for _, name, kind, required, _, key in connection.execute(f"PRAGMA table_info({table})"):
+        yield name, Column(kind, _TYPES[kind] + (() if required or key else (type(None),)))
 
 
 def remove_store(path: Path) -> None:

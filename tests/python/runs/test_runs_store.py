@@ -2,6 +2,7 @@
 import gzip
 import inspect
 import json
+import math
 import re
 import sqlite3
 from contextlib import closing
@@ -233,6 +234,49 @@ def test_another_version_is_refused(run, tmp_path, statement, message):
         other.execute(statement)
     with pytest.raises(StoreError, match=message):
         RunStore.resume(tmp_path / "run", CONFIG)
+
+
+@pytest.mark.parametrize("version", [6, 7, 10, SCHEMA_VERSION, 99])
+def test_a_store_without_a_column_of_its_schema_is_refused(run, tmp_path, version):
+    """Damage may leave text that is still SQL."""
+    run.close()
+    with sqlite3.connect(tmp_path / "run" / "run.sqlite") as other:
+        other.execute("ALTER TABLE run RENAME COLUMN wiw_version TO wiv_version")
+        other.execute(f"PRAGMA user_version = {version}")
+    unknown, known = "does not say which run", "table run: expected a column wiw_version TEXT, got none"
+    with pytest.raises(StoreError, match=f"{unknown if version in (6, 99) else known}.*restore run.sqlite"):
+        RunStore.read(tmp_path / "run")
+
+
+@pytest.mark.parametrize(
+    ("statement", "message"),
+    [
+        ("UPDATE outcome SET arm = 'mine'", r"outcome \(arm mine, episode 0\): expected an arm of the run: none, warp"),
+        ("UPDATE outcome SET metrics = '{\"success\": null}'", "metrics: success: expected int or float, got NoneType"),
+        ("UPDATE run SET info = json_set(info, '$.tables', 5)", "info: tables: expected dict, got int"),
+        ("UPDATE run SET info = json_set(info, '$.tables.cuts', 'x')", r"info: tables\.cuts: expected list, got str"),
+        ("UPDATE run SET info = json_set(info, '$.departures', json('[\"x\"]'))", r"departures\[0\]: expected dict"),
+        ("UPDATE run SET info = json_set(info, '$.stopped', json('{}'))", "stopped: 'episodes' is missing"),
+    ],
+)
+def test_a_store_edited_by_hand_is_refused_by_its_summary(run, tmp_path, statement, message):
+    run.write(OutcomeRow("warp", make_result(0)))
+    run.close()
+    with sqlite3.connect(tmp_path / "run" / "run.sqlite") as other:
+        other.execute("UPDATE run SET info = json_set(info, '$.tables', json('{}'))")
+        other.execute(statement)
+    with pytest.raises(StoreError, match=f"{message}.*edited: restore it"):
+        load_run(tmp_path / "run").numbers()
+
+
+def test_metrics_that_are_not_finite_are_summarised_as_such(run, tmp_path):
+    for arm, value in (("none", 0.5), ("warp", math.nan)):
+        for episode in range(2):
+            run.write(OutcomeRow(arm, make_result(episode, spl=value)))
+    found = load_run(tmp_path / "run").numbers()
+    assert math.isnan(found["warp"].estimates["spl"].value) and found["none"].estimates["spl"].value == 50.0
+    (difference,) = (each for each in found.differences if each.metric == "spl")
+    assert math.isnan(difference.estimate.value) and difference.wins == difference.losses == 0
 
 
 def test_damaged_and_missing_stores_are_named(tmp_path):

@@ -28,7 +28,7 @@ def fuzz(name: str, folder: Path, *options: str) -> None:
     environment = {**os.environ, "TMPDIR": str(folder)}
     done = subprocess.run(command, capture_output=True, text=True, env=environment, check=False)
     kept = sorted(folder.glob("*-*"))  # crash-, timeout-, oom-
-    assert done.returncode == 0, f"{name}: {kept}: {done.stderr[-3000:]}"
+    assert done.returncode == 0, f"{name}: {kept}: {done.stdout[-3000:]}{done.stderr[-1000:]}"  # error, then progress
     runs = re.search(r"Done (\d+) runs", done.stderr)
     edges = re.findall(r"cov: (\d+)", done.stderr)
     assert runs and int(runs[1]) > 50, done.stderr[-3000:]
