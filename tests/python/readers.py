@@ -91,24 +91,23 @@ def damage_glb(data: bytes, draw: random.Random) -> bytes:
 
 def damage_sqlite(data: bytes, draw: random.Random) -> bytes:
     """Change the values of a column, the text of a table's schema, or the number of the schema."""
-    modes = data[18:20]  # a database in memory has no log
-    with closing(sqlite3.connect(":memory:")) as connection:
-        connection.deserialize(data[:18] + b"\1\1" + data[20:])
-        tables = connection.execute("SELECT name, sql FROM sqlite_master WHERE type = 'table'").fetchall()
-        for _ in range(draw.randrange(1, 4)):
-            table, text = draw.choice(tables)
-            kind = draw.random()
-            if kind < 0.4:
-                change_column(connection, table, draw)
-            elif kind < 0.8:
-                connection.execute("PRAGMA writable_schema = ON")
-                changed = damage_words(text, draw)
-                connection.execute("UPDATE sqlite_master SET sql = ? WHERE name = ?", (changed, table))
-            else:
-                connection.execute(f"PRAGMA user_version = {draw.randrange(-1, 14)}")
-        connection.commit()
-        changed = connection.serialize()
-    return changed[:18] + modes + changed[20:]
+    with TemporaryDirectory() as folder:
+        path = Path(folder) / "damaged.sqlite"
+        path.write_bytes(data)
+        with closing(sqlite3.connect(path)) as connection, connection:
+            tables = connection.execute("SELECT name, sql FROM sqlite_master WHERE type = 'table'").fetchall()
+            for _ in range(draw.randrange(1, 4)):
+                table, text = draw.choice(tables)
+                kind = draw.random()
+                if kind < 0.4:
+                    change_column(connection, table, draw)
+                elif kind < 0.8:
+                    connection.execute("PRAGMA writable_schema = ON")
+                    changed = damage_words(text, draw)
+                    connection.execute("UPDATE sqlite_master SET sql = ? WHERE name = ?", (changed, table))
+                else:
+                    connection.execute(f"PRAGMA user_version = {draw.randrange(-1, 14)}")
+        return path.read_bytes()
 
 
 def change_column(connection: sqlite3.Connection, table: str, draw: random.Random) -> None:
