@@ -55,18 +55,20 @@ class Attempted(ModelWrapper):
         model: what is asked.
         deadline: seconds that a call may take; `math.inf` waits for ever. A model that is given the simulator is asked
             in the caller's own thread, without a deadline: a graphics context belongs to the thread that made it.
+        checks_pictures: whether frames must show the observed place; those of a world that an experiment changes do
+            not.
     """
 
-    def __init__(self, model: WorldModel, deadline: float = DEADLINE) -> None:
+    def __init__(self, model: WorldModel, deadline: float = DEADLINE, checks_pictures: bool = True) -> None:
         if not deadline > 0:
             raise ArgumentError(f"deadline: expected seconds above 0 (inf waits for ever), got {deadline}")
         super().__init__(model)
-        self.deadline = deadline
+        self.deadline, self._checks_pictures = deadline, checks_pictures
         self._tally: Counter[str] = Counter()
         self._thread: _WorkerThread | None = None
 
     def __reduce__(self) -> Any:
-        return Attempted, (self.model, self.deadline)
+        return Attempted, (self.model, self.deadline, self._checks_pictures)
 
     @property
     def spent(self) -> Mapping[str, float]:
@@ -110,7 +112,8 @@ class Attempted(ModelWrapper):
             ContractError: the answer breaks the contract.
             ExitError: the model tried to end the process; and whatever else the model raises.
         """
-        return self._ask(lambda: _catch_exit(lambda: check_rollout(self.model, observations, controls, seeds)))
+        wanted = self.model, observations, controls, seeds
+        return self._ask(lambda: _catch_exit(lambda: check_rollout(*wanted, checks_pictures=self._checks_pictures)))
 
     def _count(self, controls: Sequence[Control]) -> None:
         self._tally["calls"] += 1

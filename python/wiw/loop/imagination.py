@@ -8,7 +8,7 @@ observations. Experiments wrap one to request something else (`wiw.experiments`)
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -38,6 +38,23 @@ class ModelInput:
 
 
 @dataclass(frozen=True)
+class Answer:
+    """Frames with which a model has answered one call."""
+
+    frames: NDArray[np.uint8]
+    """[B, 1 + K, H, W, 3]; frame 0 is what the call began with."""
+    seeds: NDArray[np.uint64]
+    """[B], of the futures."""
+    first: int
+    """Frames of the plans that earlier calls imagined."""
+    lengths: Sequence[int]
+    """[B]: frames after frame 0; the rest is padding."""
+    shared: Sequence[int]
+    """[B]: frames after frame 0 that are not read, as another row answers them."""
+    view: View
+
+
+@dataclass(frozen=True)
 class Request:
     """Plans to be imagined, one entry per episode in every list."""
 
@@ -56,6 +73,8 @@ class Request:
     clock: Clock
     wordless: bool = False
     """Whether a model with control "text" is given an empty prompt."""
+    retouch: Callable[[Answer], NDArray[np.uint8]] | None = None
+    """Changes the frames of each answer before they are shown; calls that continue a plan begin with the model's own."""
 
 
 class Imagination(ABC):

@@ -14,7 +14,7 @@ from wiw import action, panorama
 from wiw._core import core, planner
 from wiw.errors import ArgumentError, ContractError
 from wiw.loop.history import RowHistories
-from wiw.loop.imagination import Imagination, ModelInput, Request
+from wiw.loop.imagination import Answer, Imagination, ModelInput, Request
 from wiw.loop.views import maker_of, view_maker
 from wiw.policies.base import FrameSpec
 from wiw.types import Conditioning, Control, Key, Observation, Rollout, View
@@ -84,6 +84,12 @@ def imagine_primitives(model: WorldModel, request: Request) -> ImaginedPrimitive
             found = ask(model, observations, controls, seeds[part.rows])
             answers.append(_require_own_memory(found, answers, model))
     with clock("platform"):
+        if request.retouch is not None:
+            pairs = zip(parts, answers, strict=True)
+            answers = [
+                request.retouch(Answer(found, seeds[part.rows], part.first, part.length, part.shared, accepts.view))
+                for part, found in pairs
+            ]
         rollouts = _show(batch, panoramas, answers, accepts.view, request.frames)
         costs = _count_cost(batch, len(request.keys))
         source_size = accepts.size if model.accepts.is_scalable else None

@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 
 from wiw import action
 from wiw.loop.history import frames_of, stack_histories
-from wiw.loop.imagination import Imagination, ModelInput, Request
+from wiw.loop.imagination import Answer, Imagination, ModelInput, Request
 from wiw.loop.imagine import list_depths, seed_of
 from wiw.loop.views import resize
 from wiw.policies.base import FrameSpec
@@ -62,9 +62,13 @@ def imagine_poses(model: WorldModel, request: Request) -> ImaginedPoses:
     for part in _split_rows(rows, accepts.best_batch):
         with clock("platform"):
             observations = _build_conditioning(accepts, [request.inputs[rows[i].episode] for i in part])
+            controls = [rows[i].control for i in part]
             seeds = np.array([rows[i].seed for i in part], np.uint64)
         with clock("world_model"):
-            found = ask(model, observations, [rows[i].control for i in part], seeds)
+            found = ask(model, observations, controls, seeds)
+        if request.retouch is not None:
+            lengths, shared = [own.length for own in controls], [own.shared for own in controls]
+            found = request.retouch(Answer(found, seeds, 0, lengths, shared, accepts.view))
         for i, own in zip(part, found, strict=True):
             answers[i] = own[_find_frames(rows[i], request.frames.ends)]
     with clock("platform"):

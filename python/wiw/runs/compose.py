@@ -124,15 +124,18 @@ def _make_imaginer(model: WorldModel | Imaginer, error: str | None, limits: Limi
         if error is not None:
             raise ArgumentError(f"error='{error}' needs a world model, got a {type(model).__name__} that asks one")
         return model
-    limited = _limit(model, limits)
-    return ModelImaginer(limited) if error is None else Erroneous(limited, make_error(error))
+    if error is None:
+        return ModelImaginer(_limit(model, limits))
+    made = make_error(error)
+    return Erroneous(_limit(model, limits, changes_world=made.needs_simulator and made.dose > 0), made)
 
 
-def _limit(model: WorldModel, limits: Limits) -> WorldModel:
+def _limit(model: WorldModel, limits: Limits, changes_world: bool = False) -> WorldModel:
     """Return the model with deadline, retries and cache; one that its user has wrapped stays as it is."""
     if model is not model.unwrapped:
         return model
-    return cache_rollouts(Attempted(model, limits.deadline), limits.cache, limits.cache_gb)
+    attempted = Attempted(model, limits.deadline, checks_pictures=not changes_world)
+    return cache_rollouts(attempted, limits.cache, limits.cache_gb)
 
 
 def require_placebo(placebo: str, space: str, episodes: int) -> None:

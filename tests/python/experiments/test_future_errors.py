@@ -5,10 +5,12 @@ from __future__ import annotations
 
 from dataclasses import replace
 from functools import cache
+from itertools import combinations
 
 import cv2
 import numpy as np
 import pytest
+from fakes import agent_for
 
 import wiw
 from wiw.action import FORWARD, TURN_LEFT
@@ -16,7 +18,7 @@ from wiw.cli import main
 from wiw.datasets.questions.facts import STRUCTURE
 from wiw.errors import ArgumentError, RolloutError
 from wiw.experiments.errors.content import list_barriers, list_things
-from wiw.experiments.errors.control import MotionDegradation, list_moves
+from wiw.experiments.errors.control import Ignored, MotionDegradation, list_moves
 from wiw.experiments.errors.drawing import paste_copies
 from wiw.experiments.errors.erroneous import Erroneous
 from wiw.experiments.errors.forks import Walker, WorldFork
@@ -27,8 +29,10 @@ from wiw.loop.attempts import Attempted
 from wiw.loop.clock import Clock
 from wiw.loop.config import AgentConfig
 from wiw.loop.imagination import ModelInput, Request
+from wiw.loop.imagine import seed_of
 from wiw.loop.memory import Query
 from wiw.loop.model_imaginer import ModelImaginer
+from wiw.loop.model_wrapper import ModelWrapper
 from wiw.loop.plan_space import plan_space
 from wiw.loop.privileged import LiveEnvironments
 from wiw.metrics import psnr, ssim
@@ -54,11 +58,12 @@ def env(two_rooms: str):
     return made
 
 
-def imagine(env, error=None, plans=(AHEAD,), model=None):
+def imagine(env, error=None, plans=(AHEAD,), model=None, decision=0, view="panorama"):
     """The rollouts of an episode's plans, at a small size, and what goes with them."""
     model = model or Oracle(SIZE)
-    imaginer = ModelImaginer(model) if error is None else Erroneous(model, make_error(error))
-    environments, key = LiveEnvironments(), Key(SEED, 0)
+    error = make_error(error) if isinstance(error, str) else error
+    imaginer = ModelImaginer(model) if error is None else Erroneous(model, error)
+    environments, key = LiveEnvironments(), Key(SEED, 0, decision)
     environments.add(key, env)
     imaginer.grant(environments)
     request = Request(
@@ -68,7 +73,7 @@ def imagine(env, error=None, plans=(AHEAD,), model=None):
         [ModelInput(env.observation)],
         [list(plans)],
         [range(len(plans))],
-        FrameSpec("panorama", SIZE),
+        FrameSpec(view, SIZE),
         Clock(),
     )
     return imaginer.imagine(request)
@@ -103,6 +108,72 @@ def test_futures_are_worse_with_every_dose_and_the_same_for_the_same_key(env, ki
     assert (np.diff(metres) >= 0).all() and (metres[-1] > 0.1) == moves, metres
     assert likeness[-1] < 0.99, likeness
     assert moves or (np.diff(likeness) <= 1e-3).all(), likeness  # plain walls look alike from places further off
+
+
+class Recorded(Ignored):
+    """Keeps the seeds that it draws from."""
+
+    def __init__(self, dose: float) -> None:
+        super().__init__(dose)
+        self.drawn_from: list[int] = []
+
+    def rollout(self, model, observations, controls, seeds):
+        self.drawn_from += map(int, seeds)
+        return super().rollout(model, observations, controls, seeds)
+
+
+def test_every_future_has_draws_of_its_own(env) -> None:
+    """Also those of the oracle, which has no seeds."""
+    plans, error = [AHEAD, Proposal([int(FORWARD)] * 3), AHEAD], Recorded(0.5)
+    found = [imagine(env, error, plans, decision=number) for number in range(2)]
+    expected = [seed_of(Key(SEED, 0, decision), plan) for decision in range(2) for plan in range(2)]
+    assert error.drawn_from == expected
+    for own, seed in zip(found, expected[::2], strict=True):
+        np.testing.assert_array_equal(
+            own.pose_errors[0][0], error.misplace(fork_of(env), AHEAD.actions, seed).mean(axis=0)
+        )
+        np.testing.assert_array_equal(own.rollouts[0][0].frames, own.rollouts[0][2].frames)
+    true = imagine(env, plans=plans).rollouts[0]
+    colors = [
+        (imagine(env, "tint@40", plans, decision=number).rollouts[0][plan].frames[-1].astype(float) - true[plan].frames[-1])
+        .mean(axis=(0, 1))
+        for number in range(2)
+        for plan in range(2)
+    ]
+    apart = [np.linalg.norm(one - other) for one, other in combinations(colors, 2)]
+    assert min(apart) > 5, colors
+
+
+class Still(wiw.WorldModel):
+    """Repeats what it is shown, three frames at a time."""
+
+    accepts = wiw.accepts("action", frames=4, size=SIZE, seeded=False)
+
+    def rollout(self, observations, controls, seeds):
+        return np.repeat(observations.image[:, None], 4, axis=1)
+
+
+@pytest.mark.parametrize("error", ["tint@40", "flicker@20", "noise@120"])
+def test_an_error_of_looks_is_the_same_in_all_parts_of_a_plan(env, error: str) -> None:
+    """A model that imagines few frames continues from its own, not from those with the error."""
+    plan = Proposal([int(FORWARD)] * 6)
+    changes = imagine(env, error, [plan], Still()).rollouts[0][0].frames.astype(float)
+    changes -= imagine(env, None, [plan], Still()).rollouts[0][0].frames
+    strengths = np.abs(changes).mean(axis=(1, 2, 3))
+    assert strengths.max() < 1.25 * strengths.min(), strengths
+    likeness = np.corrcoef(changes.reshape(6, -1))[np.triu_indices(6, 1)]
+    assert (likeness.min() > 0.9) if error == "tint@40" else (np.abs(likeness).max() < 0.3), likeness
+
+
+@pytest.mark.parametrize("kind", ERRORS)
+def test_front_views_may_have_errors(env, kind: str) -> None:
+    model = Attempted(make_oracle(size=SIZE, view="perspective"), checks_pictures=False)
+    true, found = (
+        imagine(env, error, model=model, view="front").rollouts[0][0].frames
+        for error in (None, f"{kind}@{ERRORS[kind].doses[PRIMITIVES][-1]:g}")
+    )
+    assert found.shape == true.shape and not np.array_equal(found, true)
+    assert model.spent["rows"] == 2 and model.spent["frames"] == 8
 
 
 @cache
@@ -234,10 +305,18 @@ def test_frames_of_a_changed_world_need_not_look_like_the_observation(env) -> No
             frames[:, 1:] = frames[:, 1:, ..., ::-1]
             return frames
 
-    model = Attempted(Strange(SIZE))
     with pytest.raises(RolloutError):
-        imagine(env, "moved@0", model=model)
-    assert len(imagine(env, "moved@1", model=model).rollouts[0][0].frames) == 4
+        imagine(env, "moved@0", model=Attempted(Strange(SIZE)))
+    unchecked = Attempted(Strange(SIZE), checks_pictures=False)
+    assert len(imagine(env, "moved@1", model=unchecked).rollouts[0][0].frames) == 4
+    for dose, checks in ((0, True), (1, False)):
+        agent = agent_for(ImageNav(), AgentRecipe("matcher", "oracle", error=f"moved@{dose}"))
+        (attempted,) = [one for one in list_wrappers(agent.model) if isinstance(one, Attempted)]
+        assert attempted.__reduce__()[1][2] == checks
+
+
+def list_wrappers(model) -> list:
+    return [model, *list_wrappers(model.model)] if isinstance(model, ModelWrapper) else [model]
 
 
 def test_things_on_a_table_are_drawn_elsewhere_while_physics_stays_true(bench) -> None:

@@ -3,7 +3,7 @@
 
 from __future__ import annotations
 
-from abc import ABC, abstractmethod
+from abc import ABC
 from collections.abc import Mapping, Sequence
 from typing import ClassVar, Literal
 
@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 
 from wiw._core import core
 from wiw.errors import ArgumentError
+from wiw.loop.imagination import Answer
 from wiw.types import GRIPPER_POSES, PRIMITIVES, Conditioning, Control
 from wiw.world_models.base import WorldModel
 
@@ -56,7 +57,6 @@ class Degradation(ABC):
     def __str__(self) -> str:
         return f"{self.kind}@{self.dose:g}"
 
-    @abstractmethod
     def rollout(
         self,
         model: WorldModel,
@@ -64,7 +64,12 @@ class Degradation(ABC):
         controls: Sequence[Control],
         seeds: NDArray[np.uint64],
     ) -> NDArray[np.uint8]:
-        """Return the model's frames with this error; see `WorldModel.rollout`."""
+        """Return the frames of a model that is asked with this error; see `WorldModel.rollout`. Default: without."""
+        return model.rollout(observations, controls, seeds)
+
+    def retouch(self, answer: Answer) -> NDArray[np.uint8]:
+        """Return the frames of an answer with this error, which the model itself does not see. Default: as they are."""
+        return answer.frames
 
     def misplace(self, simulator: object, actions: NDArray[np.generic], seed: int) -> NDArray[np.float64]:
         """Return how far each frame is from where it should have been taken, float64 [K, 2]: metres and degrees.

@@ -187,9 +187,9 @@ class OpenSpace(ContentDegradation):
         return np.stack([metres, np.degrees(angles)], axis=1)
 
     def _find_cameras(self, fork: WorldFork, actions: NDArray[np.int8], seed: int) -> NDArray[np.float64]:
-        generator = make_generator(seed, 1)
-        walker = Walker(fork, lambda: bool(generator.random() < self.dose))
-        return np.stack([walker.move(*move) for move in list_moves(actions)])
+        walker, passes = Walker(fork), make_generator(seed, 1).random(len(actions)) < self.dose
+        moves = zip(list_moves(actions), passes, strict=True)
+        return np.stack([walker.move(*move, bool(through)) for move, through in moves])
 
 
 @dataclass(frozen=True)

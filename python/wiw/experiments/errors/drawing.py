@@ -36,6 +36,13 @@ class MovedRenderer:
         with self._move_instances():
             self._renderer.panorama(poses, size, color, depth, instance)
 
+    def perspective(
+        self, poses: ArrayLike, size: tuple[int, int], hfov: float, color: Any, depth: Any, instance: Any
+    ) -> None:
+        """Render perspective views as `wiw._core.render.Renderer.perspective` does."""
+        with self._move_instances():
+            self._renderer.perspective(poses, size, hfov, color, depth, instance)
+
     @contextmanager
     def _move_instances(self) -> Iterator[None]:
         if len(self._ids):
@@ -61,11 +68,20 @@ class ComposedRenderer:
 
     def panorama(self, poses: ArrayLike, size: tuple[int, int], color: Any, depth: Any, instance: Any) -> None:
         """Render color panoramas, uint8 [B, H, W, 3]."""
+        self._compose("panorama", (poses, size), color)
+
+    def perspective(
+        self, poses: ArrayLike, size: tuple[int, int], hfov: float, color: Any, depth: Any, instance: Any
+    ) -> None:
+        """Render color perspective views, uint8 [B, H, W, 3]."""
+        self._compose("perspective", (poses, size, hfov), color)
+
+    def _compose(self, kind: str, camera: tuple[Any, ...], color: Any) -> None:
         shape = color.shape[:3]
         true, there = np.empty(shape, np.float32), np.empty(shape, np.float32)
         copies, ids = np.empty_like(color), np.empty(shape, np.uint32)
-        self._renderer.panorama(poses, size, color, true, None)
-        self._moved.panorama(poses, size, copies, there, ids)
+        getattr(self._renderer, kind)(*camera, color, true, None)
+        getattr(self._moved, kind)(*camera, copies, there, ids)
         paste_copies(color, true, copies, there, np.isin(ids, self._ids))
 
 

@@ -33,9 +33,9 @@ class ErroneousModel(ModelWrapper):
 
     @property
     def accepts(self) -> Accepts:  # type: ignore[override]
-        """The model's declaration; if something is drawn once per future, futures share no frames."""
+        """The model's declaration, with seeds; if something is drawn once per future, futures share no frames."""
         own = self.model.accepts
-        return replace(own, causal=False) if self.error.draws_future and self.error.dose else own
+        return replace(own, seeded=True, causal=own.causal and not self.error.draws_future) if self.error.dose else own
 
     def describe(self) -> dict[str, Any]:
         """Describe the model and the error."""
@@ -48,12 +48,21 @@ class ErroneousModel(ModelWrapper):
     def rollout(
         self, observations: Conditioning, controls: Sequence[Control], seeds: NDArray[np.uint64]
     ) -> NDArray[np.uint8]:
-        """Return the model's frames with the error."""
+        """Return the model's frames with the error, unless that is one of looks, which is added to them later."""
         if not self.error.dose:
             return self.model.rollout(observations, controls, seeds)
-        # The oracle's frames of a changed world or way need not look like the observation, so they are not held to it.
-        model = self.model.unwrapped if self.error.needs_simulator else self.model
+        model = self.model if self.model.accepts.seeded else _Unseeded(self.model)
         return self.error.rollout(model, observations, controls, seeds)
+
+
+class _Unseeded(ModelWrapper):
+    """A model without seeds, whose rollouts are those that it gives without an error."""
+
+    def rollout(
+        self, observations: Conditioning, controls: Sequence[Control], seeds: NDArray[np.uint64]
+    ) -> NDArray[np.uint8]:
+        """Ask the model; the seeds are the error's."""
+        return self.model.rollout(observations, controls, np.zeros_like(seeds))
 
 
 class Erroneous(ModelImaginer):
@@ -75,6 +84,8 @@ class Erroneous(ModelImaginer):
 
     def imagine(self, request: Request) -> Imagination:
         """Imagine all plans of all episodes, with the error."""
+        if self.error.dose:
+            request = replace(request, retouch=self.error.retouch)
         if "simulator" not in self.accepts.needs:
             return super().imagine(request)
         pairs = zip(request.keys, request.inputs, strict=True)

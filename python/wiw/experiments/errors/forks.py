@@ -4,7 +4,6 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any
 
@@ -52,34 +51,33 @@ class Walker:
 
     Args:
         fork: of the simulator; it does not move.
-        passes: asked at each step that is blocked whether it is gone all the same.
     """
 
-    def __init__(self, fork: WorldFork, passes: Callable[[], bool] = lambda: False) -> None:
+    def __init__(self, fork: WorldFork) -> None:
         self._navmesh, self._ground, self._slides = fork.world.navmesh, fork.world.ground, fork.slides
-        self._passes, self._yaw = passes, float(fork.core.yaw)
+        self._yaw = float(fork.core.yaw)
         self._place = np.asarray(self._navmesh.snap(fork.core.position), np.float64)
 
-    def move(self, forward: float, left: float, turn: float) -> NDArray[np.float64]:
+    def move(self, forward: float, left: float, turn: float, passes: bool = False) -> NDArray[np.float64]:
         """Go metres forward and to the left, then turn by radians to the left; return the camera, float64 [4, 4].
 
-        A way that is blocked is gone as far as it is free.
+        A way that is blocked is gone as far as it is free, or all the same where it `passes`.
         """
         steps = math.ceil(math.hypot(forward, left) / LONGEST - 1e-9)
         for _ in range(steps):
-            if not self._go(forward / steps, left / steps):
+            if not self._go(forward / steps, left / steps, passes):
                 break
         self._yaw += turn
         return camera_pose(np.asarray(self._ground.put_down(self._place), np.float64), self._yaw)
 
-    def _go(self, forward: float, left: float) -> bool:
+    def _go(self, forward: float, left: float, passes: bool) -> bool:
         """Go one step as the simulator does; return whether it led all the way."""
         sin, cos = math.sin(self._yaw), math.cos(self._yaw)
         end = self._place + np.array([-sin * forward - cos * left, 0.0, -cos * forward + sin * left])
         if bool(self._navmesh.is_navigable(end)):
             self._place = np.asarray(self._navmesh.snap(end), np.float64)
             return True
-        if self._passes():
+        if passes:
             self._place = end
             return True
         if self._slides:

@@ -4,15 +4,12 @@
 from __future__ import annotations
 
 from abc import abstractmethod
-from collections.abc import Sequence
-
 import cv2
 import numpy as np
 from numpy.typing import NDArray
 
 from wiw.experiments.errors.base import Degradation, make_generator, per_space
-from wiw.types import Conditioning, Control
-from wiw.world_models.base import WorldModel
+from wiw.loop.imagination import Answer
 
 WIDTH = 1024
 """Width in pixels that sizes are given for, that of a panorama; in frames of another width they are in proportion."""
@@ -29,19 +26,13 @@ class FrameDegradation(Degradation):
 
     needs_simulator = False
 
-    def rollout(
-        self,
-        model: WorldModel,
-        observations: Conditioning,
-        controls: Sequence[Control],
-        seeds: NDArray[np.uint64],
-    ) -> NDArray[np.uint8]:
-        """Return the model's frames, each changed except frame 0."""
-        frames = np.array(model.rollout(observations, controls, seeds))
-        panorama = model.accepts.view == "panorama"
-        for row, control, seed in zip(frames, controls, seeds, strict=True):
-            for k in range(1 + control.shared, 1 + control.length):
-                row[k] = self.degrade(row[k], int(seed), k, panorama)
+    def retouch(self, answer: Answer) -> NDArray[np.uint8]:
+        """Return the frames, each changed except frame 0."""
+        frames = np.array(answer.frames)
+        rows = zip(frames, answer.lengths, answer.shared, answer.seeds, strict=True)
+        for row, length, shared, seed in rows:
+            for k in range(1 + int(shared), 1 + int(length)):
+                row[k] = self.degrade(row[k], int(seed), answer.first + k, answer.view == "panorama")
         return frames
 
     @abstractmethod
@@ -51,7 +42,7 @@ class FrameDegradation(Degradation):
         Args:
             frame: as the model imagines it.
             seed: of its rollout.
-            index: of the frame in its rollout, from 1.
+            index: of the frame in its plan, from 1.
             panorama: whether its left and right edges meet.
         """
 
