@@ -140,24 +140,25 @@ def shuffle(plans: Sequence[Proposal], key: Key, spec: planner.ModelSpec) -> lis
     """Shuffle the primitives over all plans, by the decision's key; each plan keeps its length.
 
     Stops stay where they are: nothing follows them. Leading turns, equal plans and common beginnings cost a model
-    nothing, and an order may have more or fewer of them. Of `DRAWS` orders the first is taken that asks for as many
-    rollouts and frames as the plans do, or else the one that comes nearest.
+    nothing, and an order may have more or fewer of them. Of `DRAWS` orders the first is taken that leaves no plan as it
+    is and asks for as many rollouts and frames as the plans do, or else the one that comes nearest, in this order.
     """
     pool = np.concatenate([plan.actions for plan in plans])
     movable = np.flatnonzero(pool != STOP)
     wanted = _count_cost([plan.actions for plan in plans], spec)
     ends = np.cumsum([len(plan.actions) for plan in plans])[:-1]
-    best: tuple[tuple[int, int], list[NDArray[np.int8]]] | None = None
+    best: tuple[tuple[int, int, int], list[NDArray[np.int8]]] | None = None
     for draw in range(DRAWS):
         key_of_draw = core.fold_key([key.seed, key.episode, key.decision, _PURPOSE, draw])
         dealt = pool.copy()
         dealt[movable] = pool[movable[np.argsort(core.uniform(key_of_draw, len(movable)))]]
         made = np.split(dealt, ends)
         rows, frames = _count_cost(made, spec)
-        miss = abs(rows - wanted[0]), abs(frames - wanted[1])
+        same = sum(np.array_equal(one, plan.actions) for one, plan in zip(made, plans, strict=True))
+        miss = same, abs(rows - wanted[0]), abs(frames - wanted[1])
         if best is None or miss < best[0]:
             best = miss, made
-        if miss == (0, 0):
+        if not any(miss):
             break
     assert best is not None
     return [Proposal(actions, plan.prior, plan.note) for actions, plan in zip(best[1], plans, strict=True)]

@@ -17,6 +17,8 @@ from wiw.tabletop.workbench import TABLE, Pose, Thing, Workbench
 
 SIDE, SQUARE = 0.06, 0.11
 """Metres: the side of the block, and that of the squares."""
+LIFTED = 0.01
+"""Metres above the table from which the block is held up rather than slid."""
 SQUARE_DISTANCE = 0.15
 """Metres from the middle to each square."""
 BLOCK = (0.5, 0.2, 0.72)
@@ -65,9 +67,10 @@ class SlideBlock(TabletopTask):
         return [name for name in objects if name not in ("block", target)]
 
     def is_success(self, bench: Workbench, setup: TableSetup) -> bool:
-        """Return whether the block's middle is over the square."""
-        off = bench.get_pose("block")[:2, 3] - bench.get_pose(setup.target)[:2, 3]
-        return bool(np.abs(off).max() < SQUARE / 2 - 0.02)
+        """Return whether the block lies on the square, its middle well within it; one that is held up does not."""
+        block = bench.get_pose("block")[:3, 3]
+        off = block[:2] - bench.get_pose(setup.target)[:2, 3]
+        return bool(np.abs(off).max() < SQUARE / 2 - 0.02 and abs(block[2] - (TABLE + SIDE / 2)) < LIFTED)
 
     def plan_expert(
         self, places: Mapping[str, Pose], target: Any, hand: NDArray[np.float64] | None = None

@@ -64,6 +64,14 @@ def test_shuffling_differs_by_decision_and_usually_changes_plans() -> None:
     assert len(found) > 15 and tuple(tuple(p.actions.tolist()) for p in plans) not in found
 
 
+def test_shuffling_leaves_no_plan_its_own_future() -> None:
+    """Where turns begin the plans, orders that cost the same often differ in one plan alone."""
+    plans = proposals([[1, 1, 1, 1, 1], [3, 1, 1, 1, 1], [2, 1, 1, 1, 1]])
+    dealt = [shuffle(plans, Key(0, 0, decision), SPEC) for decision in range(30)]
+    same = [sum(np.array_equal(p.actions, plan.actions) for p, plan in zip(own, plans, strict=True)) for own in dealt]
+    assert np.mean(same) < 0.2
+
+
 class Seen(wiw.WorldModel):
     """Answers with the mean colour of what it is shown; remembers plans and colours."""
 

@@ -44,6 +44,20 @@ def test_experts_do_what_they_are_told(name: str, discrete: bool) -> None:
     assert all(result["poses"] <= 15 for result in results)
 
 
+def test_a_block_that_is_carried_over_its_square_is_not_slid() -> None:
+    setup = TABLETOP_TASKS["slide_block"].create_setup(0, 0)
+    bench = setup.build_workbench("cpu")
+    pose, square = bench.get_pose("block"), bench.get_pose(setup.target)[:2, 3]
+    yaw = float(np.arctan2(pose[1, 0], pose[0, 0]))
+    above, at = pose[:2, 3], ((0.15, 1), (0.03, 0), (0.25, 0))
+    for x, y, height, free in (*((*above, *own) for own in at), (*square, 0.25, 0)):
+        bench.move_to(make_action(x, y, height, free, yaw))
+    assert bench.held_object == "block" and np.abs(bench.get_pose("block")[:2, 3] - square).max() < 0.02
+    assert not TABLETOP_TASKS["slide_block"].is_success(bench, setup)
+    bench.move_to(make_action(*square, 0.03, 0, yaw))
+    assert TABLETOP_TASKS["slide_block"].is_success(bench, setup)
+
+
 @pytest.mark.parametrize("name", TABLETOP_TASKS)
 def test_another_target_than_the_one_that_is_told_is_no_success(name: str) -> None:
     env = Manipulation(name, seed=3).environment()
