@@ -7,7 +7,7 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
-from wiw.action import FORWARD, STOP, TURN_LEFT, TURN_RIGHT, TextTemplate, to_text
+from wiw.action import FORWARD, NULL, STOP, TURN_LEFT, TURN_RIGHT, TextTemplate, to_text
 from wiw.errors import ArgumentError
 from wiw.mapping_files import read_yaml_mapping
 from wiw.types import Control
@@ -61,8 +61,8 @@ def make_template(words: str | Mapping[str, Any] | None) -> TextTemplate | None:
 def write_prompt(control: Control, template: TextTemplate | None, alignment: Alignment) -> str:
     """Return the prompt of a plan; with a fixed pace it names all actions that a clip shows, padding included.
 
-    A control without words keeps none: placebos ask so.
+    A control without words keeps none: placebos ask so. A plan of poses keeps its instruction, whatever the pace.
     """
-    if not control.text or alignment.pace is None:
+    if not control.text or alignment.pace is None or (control.actions == NULL).all():
         return control.text
     return to_text(control.actions, template)

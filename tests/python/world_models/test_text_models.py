@@ -18,7 +18,7 @@ from wiw.cli import main
 from wiw.errors import ArgumentError, FileError, WeightsError
 from wiw.types import Conditioning, Control
 from wiw.world_models.clips import Alignment, frames_after_actions
-from wiw.world_models.plan_text import make_template, read_words
+from wiw.world_models.plan_text import make_template, read_words, write_prompt
 
 pytest.importorskip("diffusers", reason="no diffusers: pip install 'wiw[diffusers]'")
 
@@ -86,6 +86,11 @@ def test_frames_and_prompt_of_a_fixed_pace(made) -> None:
     frames = rollout(model, [FORWARD, TURN_LEFT])
     np.testing.assert_array_equal(frames[0, 1:, 0, 0, 0], np.rint(shades[[3, 6, 9, 12, 15]] * 255))
     assert asked == ["Do ['f 0.2', 'l 22.5', 'f 0.2', 'f 0.2', 'f 0.2']"], "padded to what the clip shows"
+
+
+def test_an_instruction_for_a_gripper_is_kept_at_a_fixed_pace() -> None:
+    told = Control.of_poses(12, "Move the gripper to the red cup and close it.")
+    assert write_prompt(told, None, Alignment.parse("frames_per_action=2", 25)) == told.text
 
 
 def test_the_loop_cuts_plans_longer_than_a_fixed_pace_shows(made, two_rooms) -> None:
