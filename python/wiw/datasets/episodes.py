@@ -40,18 +40,20 @@ def save(path: str | Path, episodes: Sequence[Episode], task: str, **about: Any)
 
 
 def _item(episode: Episode, folder: Path) -> dict[str, Any]:
-    """Return an episode as JSON; the scene's path relative to the file's folder where it lies in there."""
+    """Return an episode as JSON: the scene's path relative to the file's folder where it lies in there; NaN as null."""
     scene = Path(episode.scene)
     name = str(scene.relative_to(folder)) if scene.is_relative_to(folder) else episode.scene
     geodesic = episode.geodesic if math.isfinite(episode.geodesic) else None
-    return {**asdict(episode), "scene": name, "geodesic": geodesic}
+    goal = episode.goal_position if all(map(math.isfinite, episode.goal_position)) else None
+    return {**asdict(episode), "scene": name, "goal_position": goal, "geodesic": geodesic}
 
 
 def load(path: str | Path, scenes: str | Path = "") -> list[Episode]:
     """Read an episode file: one written by `save`, or habitat-lab's or World-in-World's.
 
     `scenes` is the folder that scene paths are relative to; if not given, the folder of a file that `save` wrote, and
-    the present one for the other formats. Lengths that a file does not give are NaN until the task has measured them.
+    the present one for the other formats. Lengths, and goals of recognition and of questions, that a file does not give
+    are NaN until the task has measured them.
 
     Raises:
         FileError: missing, not JSON, of another format or version, or an episode lacks a field; names the file.
@@ -127,7 +129,10 @@ def _episode(item: Any, where: str) -> Episode:
         raise FileError(f"{where} lacks {', '.join(missing)}")
     try:
         values = {name: read(item[name], name) for name, read in _FIELDS.items()}
-        return Episode(**values, info=_info(item.get("info", {})))
+        info = _info(item.get("info", {}))
+        if item["goal_position"] is None and not info.keys() & {"target", "question"}:
+            raise ValueError("goal_position: expected a point, as info has no target and no question, got None")
+        return Episode(**values, info=info)
     except (ValueError, ArithmeticError) as error:
         raise FileError(f"{where}: {error}") from error
 
@@ -139,6 +144,10 @@ def _info(info: Any) -> dict[str, Any]:
     return info | {name: read(info[name], f"info.{name}") for name, read in _INFO.items() if name in info}
 
 
+def _goal(value: Any, name: str) -> tuple[float, float, float]:
+    return (math.nan,) * 3 if value is None else point(value, name)
+
+
 def _length(value: Any, name: str) -> float:
     return math.nan if value is None else length(value, name)
 
@@ -148,7 +157,7 @@ _FIELDS: Mapping[str, Callable[[Any, str], Any]] = {
     "scene": text,
     "start_position": point,
     "start_yaw": number,
-    "goal_position": point,
+    "goal_position": _goal,
     "goal_yaw": number,
     "geodesic": _length,
 }

@@ -194,9 +194,10 @@ def choose_sizes(largest: int, batch: int, count: int = 4) -> tuple[int, ...]:
     whole = largest // batch * batch
     sizes = [max(batch, round(size / batch) * batch) for size in np.geomspace(max(whole, 1) / SPAN, whole, count)]
     if len(set(sizes)) < count:
+        more = f"{SPAN * batch} or more, or " if whole < SPAN * batch else ""
         raise ArgumentError(
-            f"data-scaling: {largest} clips are too few for {count} sizes in batches of {batch}; expected "
-            f"{SPAN * batch} or more"
+            f"data-scaling: {largest} clips are too few for {count} sizes in batches of {batch}; expected {more}fewer "
+            "--sizes"
         )
     return tuple(sizes)
 

@@ -140,7 +140,7 @@ class TrainingJob:
     def _train(self, material: Material) -> None:
         """Train for as many updates as planned; the learning rate's schedule ends with the last one."""
         from wiw.training.checkpoint import Checkpoint
-        from wiw.training.trainer import run_training
+        from wiw.training.trainer import run_training, take_middles
 
         learner, settings, own = make_learner(self.training.model), self.plan.settings, self.training
         recipe = create_recipe(learner, settings, own.clips, own.seed)
@@ -152,7 +152,7 @@ class TrainingJob:
                 recipe,
                 own.updates,
                 None,
-                recipe.scale_rate,
+                take_middles(recipe.scale_rate, recipe.epochs * own.updates),
                 lambda *_: None,
                 checkpoint,
             )

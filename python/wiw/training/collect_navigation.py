@@ -19,7 +19,7 @@ from typing import Any
 import numpy as np
 
 import wiw
-from wiw.datasets.navigation import META, NavigationData, count_totals, read_navigation_manifest, write_meta
+from wiw.datasets.navigation import NavigationData, count_totals, read_meta, read_navigation_manifest, write_meta
 from wiw.datasets.navigation_files import (
     FORMAT,
     SEGMENTS,
@@ -110,7 +110,7 @@ def collect_navigation(
             + "; ".join(f"{scene}: {error}" for scene, error in errors.items())
             + ". Fix them and repeat the command, or skip them with --skip-errors"
         )
-    if len(finished) < len(jobs) or not (folder / META).exists():
+    if len(finished) < len(jobs) or not _is_described(folder):
         _finish(folder, config, options, [records[number] for number in sorted(records)], errors)
     return NavigationData(folder)
 
@@ -304,6 +304,14 @@ class _Tally:
 
 
 # -- the whole dataset -------------------------------------------------------------------------------------------------
+
+
+def _is_described(folder: Path) -> bool:
+    """Return whether the dataset has its description, and the list of segments that this describes."""
+    try:
+        return bool(read_meta(folder)["files"][SEGMENTS] == describe_file(folder / SEGMENTS, 0))
+    except (FileError, OSError, KeyError):
+        return False
 
 
 def describe_data(options: NavigationCollection) -> dict[str, Any]:

@@ -51,6 +51,8 @@ class Samples:
     """float64 [N, L, 7]: the poses that the gripper went to; a shorter path repeats its last pose."""
     demonstrations: tuple[str, ...]
     """[N]: names of the demonstrations that they are from."""
+    failed: int = 0
+    """Number of other demonstrations, left out because they failed."""
 
     def __len__(self) -> int:
         return len(self.pose)
@@ -58,7 +60,8 @@ class Samples:
     def select(self, rows: NDArray[np.int64]) -> Samples:
         """Return some of the samples, by their numbers."""
         names = tuple(self.demonstrations[row] for row in rows)
-        return Samples(tuple(each.select(rows) for each in self.views), self.pose[rows], self.path[rows], names)
+        views = tuple(each.select(rows) for each in self.views)
+        return Samples(views, self.pose[rows], self.path[rows], names, self.failed)
 
     def hold_out(self, share: float = 0.05) -> tuple[Samples, Samples]:
         """Return the samples to train on, and those of a share of the demonstrations, chosen by a hash of their names.
@@ -111,25 +114,31 @@ def extract_samples(
 ) -> Samples:
     """Return a training sample for each subtask of the demonstrations, as cameras see its beginning.
 
+    Demonstrations that failed are left out: where they were given up, no path leads on.
+
     Args:
         demonstrations: with depth.
         camera: the front one.
         wrist_intrinsics: float64 [3, 3] of the wrist camera; its views are left out if not given.
 
     Raises:
-        ArgumentError: there are none, or some are of an unknown task, or without depth or the wrist camera's views.
+        ArgumentError: there are none, all failed, or some are of an unknown task, or without depth or the wrist
+            camera's views.
     """
-    cameras = Cameras(camera, wrist_intrinsics)
-    found = [
-        (*each, name_demonstration(demonstration))
-        for demonstration in demonstrations
-        for each in _split_into_subtasks(demonstration, cameras)
-    ]
+    cameras, found, failed = Cameras(camera, wrist_intrinsics), [], 0
+    for demonstration in demonstrations:
+        if demonstration.success:
+            name = name_demonstration(demonstration)
+            found += [(*each, name) for each in _split_into_subtasks(demonstration, cameras)]
+        failed += not demonstration.success
     if not found:
-        raise ArgumentError("diffuser: expected demonstrations to learn from, got none")
+        raise ArgumentError(
+            "diffuser: expected demonstrations to learn from, got "
+            + (f"{failed} that failed; collect others without --keep-failed" if failed else "none")
+        )
     views, poses, paths, names = zip(*found, strict=True)
     stacked = tuple(stack_views(each) for each in zip(*views, strict=True))
-    return Samples(stacked, np.stack(poses), np.stack(paths), names)
+    return Samples(stacked, np.stack(poses), np.stack(paths), names, failed)
 
 
 @dataclass(frozen=True)

@@ -39,12 +39,14 @@ def make_weights(
         bar: shows the progress of reading.
 
     Raises:
-        ArgumentError: demonstrations without depth, or of views in another size; a state of another training.
+        ArgumentError: demonstrations without depth, of views in another size, or that all failed; a state of another
+            training.
         FileError: demonstrations are missing or damaged, or a file cannot be written.
     """
     collection = Demonstrations(demonstrations)
     samples, held_out = _read_samples(collection, bar).hold_out()
     card: dict[str, Any] = {"demonstrations": collection.config, "moments": len(samples), "held out": len(held_out)}
+    card |= {"failed": samples.failed} if samples.failed else {}
     checkpoint = Checkpoint.beside(out, {**card, "recipe": asdict(recipe), "minutes": minutes})
     with single_thread():
         network, recipe = train(samples, recipe, minutes, on_step, checkpoint)

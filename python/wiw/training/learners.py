@@ -59,7 +59,7 @@ def make_learner(name: str) -> Learner:
 
 def _create_pocket_recipe(**numbers: Any) -> ClipRecipe:
     """Return the shipped recipe for a network about as large as warpnet, with fewer places of more clips, and without
-    averaged weights, which after few updates are still the random ones.
+    averaged weights, which lag behind where updates are few.
     """
     from wiw.training.pocket.recipe import PocketRecipe
     from wiw.training.post_training.recipe import load_recipe

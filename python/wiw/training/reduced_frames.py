@@ -4,28 +4,31 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Mapping
 from concurrent.futures import Executor, ThreadPoolExecutor
+from contextlib import ExitStack
 from dataclasses import dataclass, fields
 from functools import partial
 from hashlib import blake2b
 from pathlib import Path
-from typing import Any
+from typing import IO, Any
 
-import cv2
 import numpy as np
 from numpy.typing import NDArray
 
 from wiw.datasets.navigation import NavigationData
+from wiw.datasets.navigation_files import SEGMENTS
 from wiw.datasets.navigation_segment import DEPTH_UNITS, NavigationSegment
-from wiw.errors import ArgumentError
+from wiw.errors import ArgumentError, FileError
 from wiw.files import atomic_folder
 from wiw.training.jobs import count_threads
 from wiw.world_models.warpnet.model import shrink_panorama
 from wiw.world_models.warpnet.network import FARTHEST, NEAREST
 
-VERSION = 1
+VERSION = 2
 """Version of the kept arrays; raised when they change."""
+PICTURES = ("images", "log_distances")
+"""Arrays of pictures, which take nearly all of the room."""
 Bar = Callable[[Iterable[Any], str, int], Iterable[Any]]
 """Wraps an iterable of a given number of items in a progress bar: (items, text, total)."""
 
@@ -64,8 +67,7 @@ def reduce_frames(
     place = folder / f"frames-{_compute_digest(data, size)}"
     if not place.is_dir():
         with atomic_folder(place) as draft:
-            for name, array in _build_arrays(data, size, bar).items():
-                np.save(draft / f"{name}.npy", array)
+            _write_arrays(data, size, draft, bar)
     return ReducedFrames(
         **{each.name: np.load(place / f"{each.name}.npy", mmap_mode="r") for each in fields(ReducedFrames)}
     )
@@ -82,14 +84,43 @@ def _compute_digest(data: NavigationData, size: tuple[int, int]) -> str:
     return blake2b(json.dumps(identity, sort_keys=True).encode(), digest_size=12).hexdigest()
 
 
-def _build_arrays(data: NavigationData, size: tuple[int, int], bar: Bar) -> dict[str, NDArray[Any]]:
-    with ThreadPoolExecutor(count_threads()) as pool:
-        parts = [_reduce_segment(segment, size, pool) for segment in bar(data, "decoding segments", len(data))]
-    arrays = {name: np.concatenate([part[name] for part in parts]) for name in ("images", "log_distances", "poses")}
-    firsts = np.cumsum([0, *(len(part["images"]) for part in parts[:-1])])
-    arrays["pictures"] = np.concatenate([part["pictures"] + at for part, at in zip(parts, firsts, strict=True)])
-    arrays["starts"] = np.cumsum([0, *(len(part["pictures"]) for part in parts[:-1])])
-    return arrays
+def _write_arrays(data: NavigationData, size: tuple[int, int], folder: Path, bar: Bar) -> None:
+    """Write the arrays; those of pictures segment by segment, since together they may be larger than the memory.
+
+    Raises:
+        FileError: a segment has other pictures than the list of segments says.
+    """
+    places = sum(row["pictures"] for row in data.segments)
+    poses, pictures, at = [], [], 0
+    with ThreadPoolExecutor(count_threads()) as pool, ExitStack() as opened:
+        files = {name: opened.enter_context((folder / f"{name}.npy").open("wb")) for name in PICTURES}
+        for row, segment in zip(data.segments, bar(data, "decoding segments", len(data)), strict=True):
+            part = _reduce_segment(segment, size, pool)
+            _require_listed(data, row, len(part["poses"]))
+            for name, file in files.items():
+                _append_rows(file, part[name], places)
+            poses.append(part["poses"])
+            pictures.append(part["pictures"] + at)
+            at += len(part["poses"])
+    starts = np.cumsum([0, *(len(shown) for shown in pictures[:-1])])
+    for name, array in {"poses": np.concatenate(poses), "pictures": np.concatenate(pictures), "starts": starts}.items():
+        np.save(folder / f"{name}.npy", array)
+
+
+def _append_rows(file: IO[bytes], part: NDArray[Any], total: int) -> None:
+    """Append rows to a file in NumPy's format that will have so many in all."""
+    if not file.tell():
+        about = {"descr": part.dtype.str, "fortran_order": False, "shape": (total, *part.shape[1:])}
+        np.lib.format.write_array_header_1_0(file, about)
+    file.write(part.tobytes())
+
+
+def _require_listed(data: NavigationData, row: Mapping[str, Any], pictures: int) -> None:
+    if pictures != row["pictures"]:
+        raise FileError(
+            f"{data.folder}: {row['scene']}, segment {row['segment']}: expected {row['pictures']} pictures as in "
+            f"{SEGMENTS}, got {pictures}; delete {row['file']} and repeat `wiw collect` to recreate it"
+        )
 
 
 def _reduce_segment(segment: NavigationSegment, size: tuple[int, int], pool: Executor) -> dict[str, NDArray[Any]]:
@@ -108,7 +139,10 @@ def _reduce_segment(segment: NavigationSegment, size: tuple[int, int], pool: Exe
 
 def reduce_depth(depth: NDArray[np.float32], size: tuple[int, int]) -> NDArray[np.float16]:
     """Return log-distances [h, w] of metres [H, W], at pixels' middles; `FARTHEST` where nothing is hit (0)."""
-    return compute_log_distances(cv2.resize(depth, size[::-1], interpolation=cv2.INTER_NEAREST)).astype(np.float16)
+    rows, columns = (
+        ((np.arange(few) + 0.5) * many / few).astype(int) for few, many in zip(size, depth.shape, strict=True)
+    )
+    return compute_log_distances(depth[rows[:, None], columns]).astype(np.float16)
 
 
 def compute_log_distances(metres: NDArray[Any]) -> NDArray[np.float32]:

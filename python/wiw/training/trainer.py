@@ -97,6 +97,13 @@ def warmup_cosine_schedule(warmup: float, floor: float = 0.005) -> Callable[[flo
     return schedule
 
 
+def take_middles(schedule: Callable[[float], float], steps: int) -> Callable[[float], float]:
+    """Return a schedule that takes the factor in the middle of each of so many steps, not at its beginning: a rate that
+    rises from 0 is then 0 in no step.
+    """
+    return lambda progress: schedule(progress + 0.5 / steps)
+
+
 def _measure_step_seconds(trainer: Trainer, trials: int = 10) -> float:
     """Return the median time of a few steps, leaving out the first two, which are slow."""
     times = [time.monotonic() for _ in range(trials) if trainer.train_step(0.0) is not None]

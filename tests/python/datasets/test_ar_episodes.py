@@ -258,8 +258,12 @@ def test_the_published_files_schema_is_read(tmp_path: Path, two_rooms: str) -> N
     }
     path = tmp_path / "episodes_AR.json.gz"
     path.write_bytes(gzip.compress(json.dumps({"episodes": [item]}).encode()))
+    (read,) = episode_file.load(path, Path(two_rooms).parents[1])
+    episode_file.save(tmp_path / "own.json", [read], "ar")
+    assert repr(episode_file.load(tmp_path / "own.json")) == repr([read]) and np.isnan(read.goal_position).all()
     task = AR(episode_file=path, scene_folder=Path(two_rooms).parents[1])
     episode = task.episode(0)
+    assert AR(episode_file=tmp_path / "own.json").episode(0).goal_position == episode.goal_position
     assert (episode.episode_id, episode.scene, episode.start_yaw) == ("12", two_rooms, pytest.approx(0.4))
     assert episode.info == {"source": "world-in-world", "target": 8, "category": "table", "difficulty": 2}
     centre = np.asarray(world(two_rooms).scene.instances[7]["bounds"]).mean(axis=0)

@@ -114,6 +114,8 @@ def test_a_length_is_a_number_of_at_least_0(tmp_path: Path, metres: Any) -> None
 @pytest.mark.parametrize(
     ("change", "message"),
     [
+        ({"goal_position": None}, "goal_position: expected a point, as info has no target and no question"),
+        ({"goal_position": [0, 0]}, r"goal_position must be \[x, y, z\]"),
         ({"geodesic": -5.0}, "geodesic: expected a number of at least 0, got -5.0"),
         ({"info": {"radius": -1}}, r"info\.radius: expected a number above 0, got -1"),
         ({"info": {"radius": 0}}, r"info\.radius: expected a number above 0, got 0"),

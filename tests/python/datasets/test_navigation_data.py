@@ -369,6 +369,20 @@ def test_a_finished_dataset_is_left_alone_and_a_lost_file_is_made_anew(
     assert kept.stat().st_mtime_ns == times[kept]
 
 
+@pytest.mark.parametrize("damage", ["missing", "cut", "flipped"])
+def test_a_lost_list_of_segments_is_made_anew(damage: str, collected: Path, tmp_path: Path, two_rooms: str) -> None:
+    shutil.copytree(collected, tmp_path, dirs_exist_ok=True)
+    path = tmp_path / "segments.parquet"
+    whole = bytearray(path.read_bytes())
+    if damage == "missing":
+        path.unlink()
+    else:
+        whole[40] ^= 0xFF
+        path.write_bytes(whole[:-9] if damage == "cut" else whole)
+    collect_navigation(tmp_path, two_rooms, passes=2, lossless=True, **SMALL)
+    assert contents(tmp_path) == contents(collected)
+
+
 def test_files_are_cut_where_they_are_full(
     collected: Path, tmp_path: Path, two_rooms: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:

@@ -155,8 +155,10 @@ def test_draws_of_scenes_without_a_value_are_left_out() -> None:
 def test_sizes_are_whole_batches_over_two_orders_of_magnitude() -> None:
     assert choose_sizes(3200, 16) == (32, 144, 688, 3200)
     assert choose_sizes(12_800, 16) == (128, 592, 2752, 12_800)
-    with pytest.raises(ArgumentError, match="60 clips are too few for 4 sizes"):
+    with pytest.raises(ArgumentError, match=r"60 clips are too few for 4 sizes .* expected 1600 or more, or fewer"):
         choose_sizes(60, 16)
+    with pytest.raises(ArgumentError, match=r"3200 clips are too few for 20 sizes .*; expected fewer --sizes"):
+        choose_sizes(3200, 16, 20)
 
 
 def test_the_fewest_scenes_have_the_clips_whichever_they_are() -> None:
@@ -368,9 +370,14 @@ def test_models_become_arms_of_a_run(study: DataScaling, dataset: Path) -> None:
     assert model.card["training"] == asdict(jobs[-1].training)
 
 
-def test_pocket_is_trained_and_measured_by_the_same_job(study: DataScaling, dataset: Path) -> None:
+def test_pocket_is_trained_and_measured_by_the_same_job(
+    study: DataScaling, dataset: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     training = Training("pocket", 2, 2, 1, 0)
+    rates, stock = [], PlaceTrainer.train_step
+    monkeypatch.setattr(PlaceTrainer, "train_step", lambda self, rate: (rates.append(rate), stock(self, rate))[1])
     measures = TrainingJob(training, study.plan, dataset, study.out).run()
+    assert len(rates) == 1 and rates[0] > 0, "a single update has an effect"
     assert {"error", "regret", "psnr/1", "gap/displacements"} <= set(measures)
     file = study.out / "weights" / f"{training.name}.safetensors"
     assert Pocket(file).card["recipe"]["ema"] == 0

@@ -51,6 +51,7 @@ from wiw.training.post_training.objective import to_image
 from wiw.training.post_training.recipe import load_recipe
 from wiw.training.post_training.train import post_train
 from wiw.training.post_training.trainer import PostTrainer
+from wiw.training.trainer import run_training, take_middles
 
 pytestmark = pytest.mark.usefixtures("one_torch_thread")
 
@@ -473,6 +474,20 @@ def test_the_order_covers_the_clips_and_subsets_are_nested() -> None:
     np.testing.assert_array_equal(order.select(4), ClipOrder(50, 12, 4, 3).select(4))
 
 
+def test_the_order_is_that_of_permutations_which_are_drawn_once(monkeypatch: pytest.MonkeyPatch) -> None:
+    drawn = []
+    stock = np.random.default_rng
+    order, other = ClipOrder(total=90, count=20, batch=3, seed=11), ClipOrder(total=90, count=20, batch=3, seed=12)
+    monkeypatch.setattr(np.random, "default_rng", lambda key: (drawn.append(key), stock(key))[1])
+    for step in (*range(3 * order.steps_per_epoch), 2):
+        epoch, place = divmod(step, 6)
+        for each in (order, other):
+            chosen = stock((each.seed, 0)).permutation(90)[:20]
+            expected = chosen[stock((each.seed, 1, epoch)).permutation(20)[3 * place : 3 * place + 3]]
+            np.testing.assert_array_equal(each.select(step), expected)
+    assert len(drawn) == 2 * (1 + 3 + 1) and order == replace(order)
+
+
 def test_levels_of_a_shifted_schedule_stay_on_their_side() -> None:
     random = torch.Generator().manual_seed(0)
     high = draw_shifted_uniform(20000, 5.0, random, 0.9, 1.0)
@@ -490,6 +505,18 @@ def test_shipped_recipes_are_those_of_the_world_models() -> None:
         assert recipe.size is None and recipe.epochs == 1 and recipe.clips == 40_000
         if isinstance(family, VideoFamily):
             assert recipe.frames == family.model.accepts.frames and recipe.drop == 0.1
+
+
+def test_rates_are_those_of_the_middle_of_a_step() -> None:
+    class Noted:
+        def train_step(self, learning_rate: float) -> float:
+            rates.append(learning_rate)
+            return 0.0
+
+    rates: list[float] = []
+    recipe = load_recipe("ltx-action", options={"schedule": "linear", "warmup": 0.5, "rate": 1.0, "epochs": 2})
+    run_training(Noted, recipe, 2, None, take_middles(recipe.scale_rate, 4), lambda *_: None)
+    assert rates == [0.25, 0.75, 0.75, 0.25]
 
 
 def test_rates_follow_the_schedule() -> None:

@@ -24,7 +24,11 @@ from post_training_parts import make_trainer, save_dataset, save_stock, tiny_rec
 from safetensors.torch import load_file
 
 import tiny_pipelines
+from wiw.cli import main
+from wiw.training.post_training import encode_clips
+from wiw.training.post_training.clip_order import ClipOrder
 from wiw.training.post_training.corpora import open_corpus
+from wiw.training.post_training.encode_clips import _list_rows
 from wiw.training.post_training.families import PretrainedWeights, find_family
 from wiw.training.post_training.latent_cache import LatentCache
 from wiw.training.post_training.train import list_remedies, open_cache, post_train
@@ -53,13 +57,14 @@ def require_equal(first: PostTrainer, second: PostTrainer) -> None:
 
 
 def test_averages_are_their_formula_and_resume_exactly(data: Path, weights: Any) -> None:
-    options: dict[str, Any] = {"epochs": 6, "ema": 0.7}
+    options: dict[str, Any] = {"epochs": 6, "ema": 0.25}
     whole = make_trainer("ltx-action", data, weights("ltx-action"), **options)
     expected = {name: value.detach().double() for name, value in whole.trained.items()}
     state = io.BytesIO()
     for step in range(6):
         whole.train_step(1e-2)
-        expected = {name: 0.7 * value + 0.3 * whole.trained[name].detach() for name, value in expected.items()}
+        kept = (0.1, 2 / 11, 0.25, 0.25, 0.25, 0.25)[step]
+        expected = {name: kept * value + (1 - kept) * whole.trained[name].detach() for name, value in expected.items()}
         if step == 2:
             torch.save(whole.state_dict(), state)
     for name, value in expected.items():
@@ -75,10 +80,26 @@ def test_averages_are_their_formula_and_resume_exactly(data: Path, weights: Any)
 def test_only_the_expert_in_training_is_averaged(data: Path, weights: Any) -> None:
     name = "wan2.2-a14b-action"
     trainer = make_trainer(name, data, weights(name), ema=0.5)
-    before = {key: value.clone() for key, value in trainer.averages.items()}
-    trainer.train_step(1e-2)
-    moved = {key for key, value in trainer.averages.items() if not torch.equal(value, before[key])}
-    assert moved and not any("transformer_2" in key for key in moved)
+    moved = []
+    for _ in range(4):
+        before = {key: value.clone() for key, value in trainer.averages.items()}
+        trainer.train_step(1e-2)
+        moved.append({key for key, value in trainer.averages.items() if not torch.equal(value, before[key])})
+    assert moved[1] and not any("transformer_2" in key for key in moved[0] | moved[1])
+    assert moved[2] and all("transformer_2" in key for key in moved[2] | moved[3])
+
+
+def test_averages_of_each_expert_soon_forget_their_start(data: Path, weights: Any) -> None:
+    name = "wan2.2-a14b-action"
+    trainer = make_trainer(name, data, weights(name), ema=0.99)
+    for step in range(4):
+        active = trainer.list_active()
+        before = {key: trainer.averages[key].clone() for key in active}
+        trainer.train_step(1e-2)
+        kept = (0.1, 2 / 11)[step % 2]
+        for key in active:
+            expected = torch.lerp(trainer.trained[key].detach(), before[key], kept)
+            torch.testing.assert_close(trainer.averages[key], expected, rtol=1e-5, atol=1e-7)
 
 
 def test_the_checkpoint_has_the_averages_and_training_goes_on_with_the_weights(
@@ -92,7 +113,7 @@ def test_the_checkpoint_has_the_averages_and_training_goes_on_with_the_weights(
         found[decay] = load_file(tmp_path / str(decay) / "cdit.safetensors")
     twin = make_trainer("nwm-action", data, weights("nwm-action"), epochs=4, ema=0.9)
     for step in range(4):
-        twin.train_step(twin.recipe.rate * twin.recipe.scale_rate(step / 4))
+        twin.train_step(twin.recipe.rate * twin.recipe.scale_rate((step + 0.5) / 4))
     for name, value in found[0.9].items():
         torch.testing.assert_close(value, twin.averages[f"cdit.{name}"], rtol=0, atol=0)
     assert any(not torch.equal(value, found[0.0][name]) for name, value in found[0.9].items())
@@ -120,6 +141,37 @@ def test_a_cache_changes_nothing_but_is_read(
     require_equal(plain, reading)
     files = [path.name for path in tmp_path.rglob("*.safetensors")]
     assert 4 < len(files) <= 8 and any("mirrored" in each for each in files) and not list(tmp_path.rglob("*.part"))
+
+
+@pytest.mark.parametrize(
+    ("given", "precision", "seed"),
+    [
+        ([], "bfloat16", 5),
+        (["--seed", "0"], "bfloat16", 0),
+        (["--seed", "0", "--option", "seed=7", "--option", "precision=float32"], "float32", 7),
+    ],
+)
+def test_numbers_of_a_recipe_file_are_kept_unless_options_replace_them(
+    given: list[str], precision: str, seed: int, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    found: list[Any] = []
+    monkeypatch.setattr(encode_clips, "encode_clips", lambda *_, **named: (found.append(named["recipe"]), 1)[1])
+    (tmp_path / "mine.yaml").write_text("precision: bfloat16\nseed: 5\n")
+    (tmp_path / "data").mkdir()
+    asked = ["train", "nwm-action", "--data", str(tmp_path / "data"), "--cache", str(tmp_path / "cache")]
+    asked += ["--encode-only", "--device", "cpu"]
+    assert main([*asked, "--recipe", str(tmp_path / "mine.yaml"), *given]) == 0
+    assert main(asked) == 0
+    assert [(each.precision, each.seed) for each in found] == [(precision, seed), ("float32", 0)]
+
+
+def test_the_clips_to_encode_are_those_that_a_training_takes(data: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    recipe = tiny_recipe("ltx-action", clips=7, batch=2, mirror=0.5)
+    order = ClipOrder(len(open_corpus(data, "all").clips(recipe.frames)), 7, 2, recipe.seed)
+    seen = {int(row) for step in range(9 * order.steps_per_epoch) for row in order.select(step)}
+    monkeypatch.setattr(ClipOrder, "select", None)  # which draws an order for each step
+    rows = list(_list_rows("ltx-action", data, recipe, "all"))
+    assert [(row["clip"], row["mirrored"]) for row in rows] == [(row, side) for row in sorted(seen) for side in (0, 1)]
 
 
 def test_a_damaged_file_of_the_cache_is_made_anew(data: Path, weights: Any, tmp_path: Path) -> None:

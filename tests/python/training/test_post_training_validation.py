@@ -42,6 +42,7 @@ from wiw.training.post_training.sampling import create_sampler
 from wiw.training.post_training.trackers import open_tracker
 from wiw.training.post_training.train import post_train, write_checkpoint
 from wiw.training.post_training.training_log import TrainingLog
+from wiw.training.post_training.validation import ValidatedTrainer
 from wiw.types import Conditioning
 
 NAMES = sorted(name for name, family in FAMILIES.items() if isinstance(family, VideoFamily))
@@ -157,6 +158,32 @@ def test_another_dataset_may_be_validated_on(data: Path, train: Any, tmp_path: P
     assert "validation" not in train(tmp_path / "alone", part="all", numbers={"epochs": 1})
 
 
+@pytest.mark.parametrize(
+    ("part", "every", "given", "said"),
+    [
+        ("all", 2, ["decisions"], "decisions: .*nowhere has no effect on a training without validation: --part all"),
+        ("train", None, ["decisions"], "decisions: .*nowhere has no effect .*: the recipe's validate_every is null"),
+        (
+            "all",
+            None,
+            ["validation", "decisions"],
+            "validation: .*nowhere has no effect .*: the recipe's validate_every is null",
+        ),
+    ],
+)
+def test_what_is_given_for_a_validation_that_there_is_not_is_refused(
+    part: str, every: int | None, given: list[str], said: str, train: Any, tmp_path: Path
+) -> None:
+    with pytest.raises(ArgumentError, match=said):
+        train(
+            tmp_path / "out",
+            part=part,
+            numbers={"validate_every": every},
+            **dict.fromkeys(given, tmp_path / "nowhere"),
+        )
+    assert not list(tmp_path.iterdir())
+
+
 def test_rank_agreement_is_measured_on_stored_decisions(train: Any, tmp_path: Path) -> None:
     rng = np.random.default_rng(0)
     seen = rng.integers(0, 255, (2, 5, 32, 64, 3)).astype(np.uint8)
@@ -178,6 +205,24 @@ def test_a_training_that_is_stopped_while_it_validates_ends_with_the_same_bytes(
     train: Any, tmp_path: Path, monkeypatch: Any
 ) -> None:
     require_same_bytes_when_stopped_at_sample(5, 4, train, tmp_path, monkeypatch)
+
+
+@pytest.mark.parametrize("steps", [4, 6])
+def test_best_weights_of_a_step_that_is_to_come_are_forgotten(steps: int, tmp_path: Path) -> None:
+    class Resumed:
+        step_count = 0
+
+        def load_state_dict(self, state: Any) -> None:
+            self.step_count = state["count"]
+
+    log = TrainingLog(tmp_path / "metrics.jsonl")
+    for step in (2, 4, 6):
+        log.write(step, {"validation/psnr": float(step)})
+    (tmp_path / "best").mkdir()
+    (tmp_path / "best" / "training.json").write_text(json.dumps({"steps": steps, "validation": {"psnr": 9.0}}))
+    resumed = ValidatedTrainer(Resumed(), None, None, log, lambda *_: None)  # type: ignore[arg-type]
+    resumed.load_state_dict({"count": 4})
+    assert [line["step"] for line in log.read()] == [2, 4] and resumed.best.exists() == (steps == 4)
 
 
 def test_a_log_forgets_what_comes_later_and_half_a_line(tmp_path: Path) -> None:

@@ -36,6 +36,7 @@ from wiw.training.reduced_frames import ReducedFrames, reduce_frames  # noqa: E4
 from wiw.training.train_on_clips import create_sampler, train_on_clips  # noqa: E402
 from wiw.types import Conditioning  # noqa: E402
 from wiw.world_models.pocket.model import Pocket  # noqa: E402
+from wiw.world_models.pocket.network import Denoiser, Views  # noqa: E402
 from wiw.world_models.pocket.weights import load  # noqa: E402
 from wiw.world_models.warpnet.network import warp  # noqa: E402
 
@@ -84,7 +85,7 @@ def test_frames_are_decoded_once_and_show_what_the_dataset_shows(
             picture = int(frames.pictures[first + at])
             shown = np.roll(frames.images[picture], int(segment.rolls[at]), axis=1)
             np.testing.assert_array_equal(shown, segment.images[at])
-    monkeypatch.setattr("wiw.training.reduced_frames._build_arrays", None)
+    monkeypatch.setattr("wiw.training.reduced_frames._write_arrays", None)
     again = reduce_frames(data, (64, 128), tmp_path)
     np.testing.assert_array_equal(again.images, frames.images)
 
@@ -173,6 +174,25 @@ def test_it_resumes_exactly(dataset: Path, tmp_path: Path) -> None:
             assert torch.equal(value, other[name]), name
 
 
+def test_the_first_update_of_a_training_has_an_effect(dataset: Path, tmp_path: Path) -> None:
+    rates = {"rate": 1e-3, "warmup": 0.5, "decay": 0.5, "validate_every": None}
+    train_on_clips("pocket", dataset, tmp_path / "out", tmp_path, recipe(epochs=2, **rates), "all")
+    log = (tmp_path / "out.log" / "metrics.jsonl").read_text().splitlines()
+    assert [json.loads(line)["rate"] for line in log] == pytest.approx([5e-4, 5e-4])
+
+
+def test_after_few_updates_averages_are_near_the_weights(dataset: Path, tmp_path: Path) -> None:
+    learner = trainer(dataset, tmp_path, epochs=8)
+    start = {name: value.detach().clone() for name, value in learner.trained.items()}
+    for _ in range(8):
+        learner.train_step(1e-3)
+    moved, behind = (
+        sum(float((value - other[name]).detach().square().sum()) for name, value in learner.trained.items())
+        for other in (start, learner.averages)
+    )
+    assert learner.recipe.ema == 0.995 and behind < 0.2 * moved
+
+
 def test_a_loss_that_is_not_finite_stops_it_and_names_the_clips(dataset: Path, tmp_path: Path) -> None:
     learner = trainer(dataset, tmp_path)
     before = [value.clone() for value in learner.network.parameters()]
@@ -198,6 +218,8 @@ def test_the_rate_rises_stays_and_falls() -> None:
     [
         ({"size": (24, 48)}, "size: expected a height of a multiple of 16"),
         ({"widths": (8, 8, 8)}, "widths: expected four"),
+        ({"widths": (16, 16, 32, 32)}, "widths: expected 32 or more after the first"),
+        ({"widths": (64, 104, 160, 224)}, r"share the channels evenly, got \(64, 104, 160, 224\)"),
         ({"places": 0}, "places: expected 1 or more"),
         ({"pure_noise": 1.5}, "pure_noise: expected a share"),
         ({"least_level": 0}, "least_level: expected a level"),
@@ -207,6 +229,14 @@ def test_the_rate_rises_stays_and_falls() -> None:
 def test_a_recipe_that_cannot_be_is_refused(changes: dict[str, Any], said: str) -> None:
     with pytest.raises(ArgumentError, match=said):
         recipe(**changes)
+
+
+@pytest.mark.parametrize("widths", [(8, 40, 48, 56), (32, 48, 72, 96), (32, 48, 64, 88)])
+def test_widths_that_a_recipe_takes_can_be_run(widths: tuple[int, ...]) -> None:
+    network = Denoiser(16, recipe(widths=widths).widths)
+    source, places = torch.zeros(1, 3, *SIZE), torch.zeros(1, 2, 2)
+    estimate = network(torch.zeros(1, 2, 3, *SIZE), torch.ones(1), Views.around(source, places).sweep, places)
+    assert estimate.residual.shape == (2, 3, *SIZE)
 
 
 # -- measuring ---------------------------------------------------------------------------------------------------------
@@ -269,6 +299,23 @@ def test_the_command_trains_measures_and_is_run(
     assert card["steps"] == 2 and set(card["held_out"]) == {"mixed", "straight"}
     assert set(card["held_out"]["mixed"]["psnr"]) == {"copy", "rolled", "one room", "pocket"}
     assert not list(tmp_path.glob("*.checkpoint"))
+
+
+@pytest.mark.parametrize(("given", "seed"), [([], 5), (["--seed", "0"], 0), (["--seed", "3"], 3)])
+def test_a_seed_replaces_that_of_the_recipe_file(
+    given: list[str], seed: int, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    found: list[int] = []
+
+    def note(*arguments: Any) -> None:
+        found.append(arguments[5].seed)
+        raise FileError("as far as the test goes")
+
+    monkeypatch.setattr("wiw.cli.train.pocket.train_and_measure", note)
+    (tmp_path / "mine.yaml").write_text("seed: 5\n")
+    command = ["train", "pocket", "--data", str(tmp_path), "--out", str(tmp_path / "p")]
+    assert main([*command, "--recipe", str(tmp_path / "mine.yaml"), *given]) == 2
+    assert found == [seed]
 
 
 @pytest.mark.parametrize(

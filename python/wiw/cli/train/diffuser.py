@@ -34,7 +34,7 @@ def train_diffuser(
     Args:
         out: File for the weights (safetensors).
         demonstrations: Folder of `wiw collect manipulation --depth`. The policy also learns to use the wrist camera if
-            they have its views (--wrist).
+            they have its views (--wrist). Failed demonstrations (--keep-failed) are left out.
         epochs: Number of epochs: how often each sample is used, on average. Default: 40.
         limits: Time limit and seed.
     """
@@ -62,7 +62,8 @@ def _report(card: Mapping[str, Any]) -> None:
     from wiw.training.diffuser_paths import PATHS
 
     found = card["found"]
-    print(f"{card['moments']} samples, {card['recipe']['epochs']} epochs")
+    left_out = f", {card['failed']} failed demonstrations left out" if "failed" in card else ""
+    print(f"{card['moments']} samples, {card['recipe']['epochs']} epochs{left_out}")
     if not found:
         return
     near = ", ".join(f"one of {paths} for {100 * found[f'near/{paths}']:.0f} %" for paths in PATHS)

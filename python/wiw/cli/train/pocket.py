@@ -29,7 +29,7 @@ def train_pocket(
     tracker: TrackerName | None = None,
     device: Annotated[str | None, arg(metavar="DEVICE", help_behavior_hint="")] = None,
     epochs: Count = None,
-    seed: Annotated[int, arg(metavar="N")] = 0,
+    seed: Annotated[int | None, arg(metavar="N", help_behavior_hint="")] = None,
     cache: Annotated[Path | None, arg(metavar="DIR", help_behavior_hint="")] = None,
 ) -> int:
     """Train pocket, a world model for navigation: a small video diffusion model that generates all views of a plan
@@ -61,7 +61,7 @@ def train_pocket(
             same data in any case.
         device: Where to train: cpu, cuda, cuda:1, ... Default: the GPU if there is one.
         epochs: Number of epochs: how often each clip is used, on average. Default: 1.
-        seed: Seed of the order of clips and of the weights.
+        seed: Seed of the order of clips and of the weights. Default: that of the recipe, 0.
         cache: Folder for prepared training data, which can be deleted at any time. Default: $WIW_CACHE/looks.
     """
     from wiw.runs.part_options import parse_options
@@ -75,7 +75,7 @@ def train_pocket(
     check_seed(seed)
     require(Pocket.requires)
     with write_weights("pocket", out):
-        numbers = drop_none({"epochs": epochs, "seed": seed or None})
+        numbers = drop_none({"epochs": epochs, "seed": seed})
         options = {**numbers, **parse_options(option, PocketRecipe, "--option")}
         chosen = load_recipe("pocket", recipe, options, kind=PocketRecipe)
         watched: dict[str, Any] = {

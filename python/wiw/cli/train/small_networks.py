@@ -33,9 +33,9 @@ def check_counts(**counts: int | None) -> None:
             raise ArgumentError(f"--{name}: expected 1 or more, got {count}")
 
 
-def check_seed(seed: int) -> None:
+def check_seed(seed: int | None) -> None:
     """Refuse seeds that are out of range."""
-    if not 0 <= seed < 2**63:
+    if seed is not None and not 0 <= seed < 2**63:
         raise ArgumentError(f"--seed: expected 0 to 2**63 - 1, got {seed}")
 
 

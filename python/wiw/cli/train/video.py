@@ -58,7 +58,7 @@ def make_command(name: str) -> Callable[..., int]:
         decisions: Annotated[Path | None, arg(metavar="FILE", help_behavior_hint="")] = None,
         tracker: TrackerName | None = None,
         epochs: Count = None,
-        seed: Annotated[int, arg(metavar="N")] = 0,
+        seed: Annotated[int | None, arg(metavar="N", help_behavior_hint="")] = None,
         cache: Annotated[Path | None, arg(metavar="DIR", help_behavior_hint="")] = None,
         encode_only: bool = False,
         workers: Count = None,
@@ -68,7 +68,7 @@ def make_command(name: str) -> Callable[..., int]:
     ) -> int:
         check_counts(epochs=epochs, workers=workers)
         check_seed(seed)
-        numbers = drop_none({"epochs": epochs, "seed": seed or None})
+        numbers = drop_none({"epochs": epochs, "seed": seed})
         parts: dict[str, Any] = {"weights": weights, "device": device, "part": part}
         if encode_only:
             unused = {"--out": out, "--validation": validation, "--decisions": decisions, "--tracker": tracker}
@@ -120,7 +120,7 @@ HELP = """Post-train TITLE, starting from pretrained weights, to follow actions.
         tracker: Experiment tracker that plots loss and validation; requires its package. OUT.log/metrics.jsonl has the
             same data in any case.
         epochs: Number of epochs: how often each clip is used, on average. Default: 1.
-        seed: Seed of the order of clips and of the weights.
+        seed: Seed of the order of clips and of the weights. Default: that of the recipe, 0.
         cache: Folder for clips as encoded by the frozen networks, for later epochs and other trainings. Default: none.
         encode_only: Only encode the training clips into --cache; train nothing.
         workers: Number of processes that encode clips for --encode-only. Default: 1.
@@ -264,13 +264,15 @@ def _launch(
 def _choose_recipe(
     name: str, file: Path | None, pairs: Sequence[str], numbers: Mapping[str, Any], parts: Mapping[str, Any]
 ) -> PostTrainingRecipe:
+    from wiw.mapping_files import read_yaml_mapping
     from wiw.runs.part_options import parse_options
     from wiw.training.post_training.recipe import PostTrainingRecipe, load_recipe
     from wiw.training.post_training.train import choose_precision
 
     options = {**numbers, **parse_options(pairs, PostTrainingRecipe, "--option")}
     chosen = load_recipe(name, file, options)
-    return chosen if "precision" in options else choose_precision(chosen, parts.get("device"))
+    named = {*options, *(read_yaml_mapping(file, "a recipe, `name: value` lines") if file else ())}
+    return chosen if "precision" in named else choose_precision(chosen, parts.get("device"))
 
 
 def _write_command(out: Path, run: Mapping[str, Any]) -> str:

@@ -134,7 +134,7 @@ def _train_on_data(
     from wiw.training.warpnet import evaluate
     from wiw.training.warpnet_clips import WarpNetClipRecipe
 
-    numbers = drop_none({"epochs": epochs, "seed": seed or None})
+    numbers = drop_none({"epochs": epochs, "seed": seed})
     options = {**numbers, **parse_options(option, WarpNetClipRecipe, "--option")}
     recipe = load_recipe("warpnet", options=options, kind=WarpNetClipRecipe)
     card = train_and_measure("warpnet", out, data, preparation.folder, val, recipe, watched, evaluate)

@@ -52,9 +52,20 @@ class PocketRecipe(ClipRecipe):
             raise ArgumentError(f"recipe: size: expected a height of a multiple of 16, twice as wide, got {self.size}")
         if len(self.widths) != 4 or any(each < 8 or each % 8 for each in self.widths):
             raise ArgumentError(f"recipe: widths: expected four multiples of 8, got {self.widths}")
+        self._require_whole_heads()
 
     def scale_rate(self, progress: float) -> float:
         """Return the factor of the learning rate after a share of the steps, 0 to 1."""
         rise = progress / self.warmup if self.warmup else 1.0
         fall = (1 - progress) / self.decay if self.decay else 1.0
         return min(1.0, rise, fall)
+
+    def _require_whole_heads(self) -> None:
+        """Check that the network's heads of attention, at all scales but the finest, have whole numbers of channels."""
+        from wiw.world_models.pocket.network import HEAD_WIDTH
+
+        if any(each < HEAD_WIDTH or each % (each // HEAD_WIDTH) for each in self.widths[1:]):
+            raise ArgumentError(
+                f"recipe: widths: expected {HEAD_WIDTH} or more after the first, best multiples of {HEAD_WIDTH}, so "
+                f"that heads of attention share the channels evenly, got {self.widths}"
+            )

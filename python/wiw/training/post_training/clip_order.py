@@ -4,6 +4,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import cached_property, lru_cache
 
 import numpy as np
 from numpy.typing import NDArray
@@ -29,9 +30,19 @@ class ClipOrder:
         """Number of steps in an epoch."""
         return self.count // self.batch
 
+    @cached_property
+    def chosen(self) -> NDArray[np.int64]:
+        """int64 [count]: indices of the clips that are trained on."""
+        return np.random.default_rng((self.seed, 0)).permutation(self.total)[: self.count].copy()
+
     def select(self, step: int) -> NDArray[np.int64]:
         """Return the indices [batch] of the clips of a step, counted from 0 over all epochs."""
         epoch, place = divmod(step, self.steps_per_epoch)
-        chosen = np.random.default_rng((self.seed, 0)).permutation(self.total)[: self.count]
-        order = np.random.default_rng((self.seed, 1, epoch)).permutation(self.count)
-        return chosen[order[place * self.batch : (place + 1) * self.batch]]
+        order = _shuffle(self.seed, epoch, self.count)
+        return self.chosen[order[place * self.batch : (place + 1) * self.batch]]
+
+
+@lru_cache(maxsize=2)
+def _shuffle(seed: int, epoch: int, count: int) -> NDArray[np.int64]:
+    """Return an epoch's order of `count` clips; kept, as each of its steps asks for it."""
+    return np.random.default_rng((seed, 1, epoch)).permutation(count)

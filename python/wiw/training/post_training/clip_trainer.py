@@ -78,6 +78,11 @@ class ClipTrainer(ResumableTrainer, ABC):
         return 1
 
     @property
+    def updates(self) -> int:
+        """Number of updates that the network in training has had."""
+        return self.step_count
+
+    @property
     def rows(self) -> int:
         """Clips in one pass through the networks; gradients of several passes are added up."""
         return self.recipe.batch
@@ -176,11 +181,12 @@ class ClipTrainer(ResumableTrainer, ABC):
 
     @torch.no_grad()
     def _average_weights(self) -> None:
-        """Move the averages of what the step trained towards its weights."""
+        """Move the averages of what the step trained towards its weights; the sooner, the nearer their start is."""
         if self.averages:
+            decay = min(self.recipe.ema, (1 + self.updates) / (10 + self.updates))
             names = self.list_active()
             averages, weights = ([each[name] for name in names] for each in (self.averages, self.trained))
-            get_ema_multi_avg_fn(self.recipe.ema)(averages, weights, None)
+            get_ema_multi_avg_fn(decay)(averages, weights, None)
 
     def _add_gradients(self, batch: NDArray[np.int64], first: int) -> float:
         """Add the gradients of one pass, from clip `first` of a batch on; return its part of the batch's mean loss."""

@@ -7,7 +7,6 @@ A training with this cache then reads every clip as the frozen networks encode i
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Mapping
-from dataclasses import replace
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -116,8 +115,8 @@ class ClipEncoder:
 def _list_rows(name: str, data: str | Path, recipe: PostTrainingRecipe, part: CorpusPart) -> Iterator[dict[str, Any]]:
     """Yield the clips that a training uses, including mirrored ones where it mirrors some."""
     corpus, fitted = find_family(name).fit(open_corpus(data, part, recipe.held_out), recipe)
-    order = replace(arrange_clips(len(corpus.clips(fitted.frames)), fitted), batch=1)
+    order = arrange_clips(len(corpus.clips(fitted.frames)), fitted)
     sides = [side for side, share in ((False, 1 - fitted.mirror), (True, fitted.mirror)) if share > 0]
-    for index in sorted(int(order.select(step)[0]) for step in range(order.steps_per_epoch)):
+    for index in np.sort(order.chosen).tolist():
         for side in sides:
             yield {"clip": index, "mirrored": side}

@@ -47,7 +47,8 @@ class ClipRecipe(ABC):
     optimizer: OptimizerName = "adamw"
     """AdamW; "adamw8bit" keeps its moments in 8 bits, 2 bytes a parameter instead of 8."""
     ema: float = 0.0
-    """Decay a step of averaged weights, which are what is kept; 0 averages nothing."""
+    """Decay a step of averaged weights, which are what is kept; 0 averages nothing. After n updates it is at most
+    (1 + n) / (10 + n), so that averages soon forget the weights that training began with."""
     precision: Precision = "bfloat16"
     """Precision of matrix products and of frozen weights; trained weights are float32."""
     seed: int = 0

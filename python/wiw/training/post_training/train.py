@@ -35,7 +35,7 @@ from wiw.training.post_training.validation import (
     build_validation_set,
     find_held_out,
 )
-from wiw.training.trainer import run_training
+from wiw.training.trainer import run_training, take_middles
 from wiw.types import GRIPPER_POSES, PRIMITIVES
 from wiw.world_models import devices
 from wiw.world_models.video import loading
@@ -207,6 +207,11 @@ def _run_steps(
 ) -> None:
     inner = trainer.trainer
     recipe, phases = inner.recipe, inner.phases
+
+    def scale_rate(progress: float) -> float:
+        """Scale by the schedule of the network in training, each of which has its own."""
+        return recipe.scale_rate(progress * phases % 1)
+
     with state.watch():
         try:
             run_training(
@@ -214,7 +219,7 @@ def _run_steps(
                 recipe,
                 inner.steps_per_epoch,
                 None,
-                lambda progress: recipe.scale_rate(progress * phases % 1),  # each network has a schedule of its own
+                take_middles(scale_rate, recipe.epochs * inner.steps_per_epoch),
                 lambda step, steps, _: on_step(step, steps, inner.mean_loss) if distributed.is_main() else None,
                 state,
             )

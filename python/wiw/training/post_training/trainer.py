@@ -67,6 +67,11 @@ class PostTrainer(ClipTrainer):
         return len(self.model.places)
 
     @property
+    def updates(self) -> int:
+        """Number of updates that the network of the present step has had."""
+        return self.locate(self.step_count)[1]
+
+    @property
     def rows(self) -> int:
         """Clips in one pass through the networks."""
         return self.recipe.rows

@@ -4,6 +4,7 @@
 from __future__ import annotations
 
 import json
+import shutil
 from collections.abc import Callable, Mapping
 from collections.abc import Set as AbstractSet
 from dataclasses import dataclass
@@ -89,10 +90,14 @@ def find_held_out(
 
     Raises:
         ArgumentError: another kind of dataset or height of the camera, nothing is held out, something is in both,
-            decisions for an arm, or decisions in scenes that are trained on.
+            decisions for an arm, decisions in scenes that are trained on, or either without a validation.
         FileError: the dataset, or the file of decisions, is missing or damaged.
     """
-    if recipe.validate_every is None or (validation is None and corpus.part != "train"):
+    if recipe.validate_every is None:
+        _require_none(validation, decisions, "the recipe's validate_every is null; leave it out, or set validate_every")
+        return None
+    if validation is None and corpus.part != "train":
+        _require_none(None, decisions, "--part all holds nothing out; give another dataset with --validation")
         return None
     held_out = open_part(corpus.data.folder, "held-out") if validation is None else open_part(validation, "all")
     if held_out.space != corpus.space:
@@ -121,6 +126,13 @@ def find_held_out(
             "validate_every=null)"
         )
     return held_out
+
+
+def _require_none(validation: str | Path | None, decisions: str | Path | None, why: str) -> None:
+    """Refuse what a training without validation does not read."""
+    for name, given in {"validation": validation, "decisions": decisions}.items():
+        if given is not None:
+            raise ArgumentError(f"{name}: {given} has no effect on a training without validation: {why}")
 
 
 def _require_unseen_decisions(decisions: str | Path | None, trained: AbstractSet[str]) -> None:
@@ -263,20 +275,30 @@ class ValidatedTrainer(ResumableTrainer):
         return self.trainer.state_dict()
 
     def load_state_dict(self, state: Mapping[str, Any]) -> None:
-        """Resume from a state that `state_dict` returned; what was logged after it is forgotten.
+        """Resume from a state that `state_dict` returned; what was logged or found best after it is forgotten.
 
         Raises:
             FileError: the log cannot be read or written.
         """
         self.trainer.load_state_dict(state)
-        lines = distributed.call_on_main(lambda: self._log.rewind(self.step_count))
+        lines = distributed.call_on_main(self._rewind)
         self._validated = {line["step"] for line in lines if f"{PREFIX}{CRITERION}" in line}
 
+    def _rewind(self) -> list[dict[str, Any]]:
+        """Rewind the log to the present step, and remove best weights of a later one; return the lines that stay."""
+        lines = self._log.rewind(self.step_count)
+        if self._read_card().get("steps", 0) > self.step_count:
+            shutil.rmtree(self.best, ignore_errors=True)
+        return lines
+
     def _read_best(self) -> float:
+        card = self._read_card()
+        return float(card["validation"][CRITERION]) if card else -np.inf
+
+    def _read_card(self) -> dict[str, Any]:
+        """Return what is known about the best weights; empty if there are none."""
         card = self.best / CARD
-        if not card.exists():
-            return -np.inf
-        return float(json.loads(card.read_text(encoding="utf-8"))["validation"][CRITERION])
+        return dict(json.loads(card.read_text(encoding="utf-8"))) if card.exists() else {}
 
 
 def draw_sheet(clips: HeldOutClips[Any], own: Frames, other: Frames) -> NDArray[np.uint8]:
