@@ -188,8 +188,8 @@ class OpenSpace(ContentDegradation):
 
     def _find_cameras(self, fork: WorldFork, actions: NDArray[np.int8], seed: int) -> NDArray[np.float64]:
         walker, passes = Walker(fork), make_generator(seed, 1).random(len(actions)) < self.dose
-        moves = zip(list_moves(actions), passes, strict=True)
-        return np.stack([walker.move(*move, bool(through)) for move, through in moves])
+        moves = zip(*list_moves(actions).T, passes, strict=True)
+        return np.stack([walker.move(ahead, left, turn, bool(through)) for ahead, left, turn, through in moves])
 
 
 @dataclass(frozen=True)
