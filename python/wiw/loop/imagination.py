@@ -74,7 +74,7 @@ class Request:
     wordless: bool = False
     """Whether a model with control "text" is given an empty prompt."""
     retouch: Callable[[Answer], NDArray[np.uint8]] | None = None
-    """Changes the frames of each answer before they are shown; calls that continue a plan begin with the model's own."""
+    """Changes the frames of answers before they are shown; calls that continue a plan begin with the model's own."""
 
 
 class Imagination(ABC):

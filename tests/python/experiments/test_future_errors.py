@@ -135,8 +135,10 @@ def test_every_future_has_draws_of_its_own(env) -> None:
         np.testing.assert_array_equal(own.rollouts[0][0].frames, own.rollouts[0][2].frames)
     true = imagine(env, plans=plans).rollouts[0]
     colors = [
-        (imagine(env, "tint@40", plans, decision=number).rollouts[0][plan].frames[-1].astype(float) - true[plan].frames[-1])
-        .mean(axis=(0, 1))
+        (
+            imagine(env, "tint@40", plans, decision=number).rollouts[0][plan].frames[-1].astype(float)
+            - true[plan].frames[-1]
+        ).mean(axis=(0, 1))
         for number in range(2)
         for plan in range(2)
     ]

@@ -4,6 +4,7 @@
 from __future__ import annotations
 
 from abc import abstractmethod
+
 import cv2
 import numpy as np
 from numpy.typing import NDArray
