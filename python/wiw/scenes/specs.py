@@ -15,6 +15,8 @@ from wiw.suggestions import did_you_mean
 
 SPLIT_SIZE = 1000
 """Number of apartments in a spec without a number."""
+MOST_DIGITS = 6
+"""Digits of the greatest number in a spec: a list of more apartments would fill the memory."""
 APARTMENTS = r"apartments:(train|val|test)(?:(?::([0-9]+))?:([1-9][0-9]*)|/([0-9]+))?"
 """Split, first, end, and number of a single one. A single one may be followed by "?" and edits, joined by "&"."""
 _FORMS = (
@@ -49,11 +51,11 @@ def resolve(spec: str | PathLike[str]) -> list[str]:
     "apartments:val" and "apartments:val:40" are the first 1000 or 40 apartments of a split, "apartments:val:40:60" are
     numbers 40 to 59, each named "apartments:val/7"; "hm3d:DIR:val" is each scan of a dataset's split, by its file (see
     `wiw.scenes.scans.formats.KINDS`); anything else is the path of a mesh or a Gazebo world. The edits of
-    "apartments:val/7?state:floor_lamp_1=off&color:sofa_1=blue" are put into canonical order and spelling, so that equal
-    scenes have equal names; whether the apartment allows them is checked when it is opened.
+    "apartments:val/7?state:floor_lamp_1=off&color:sofa_1=blue" are put into canonical order and spelling, as is the
+    number, so that equal scenes have equal names; whether the apartment allows the edits is checked when it is opened.
 
     Raises:
-        ArgumentError: the split, the count or an edit is invalid.
+        ArgumentError: the split, a number or an edit is invalid.
         FileError: the file does not exist, or the folder has no scan.
     """
     spec = fspath(spec)
@@ -72,14 +74,22 @@ def resolve(spec: str | PathLike[str]) -> list[str]:
     if match is None:
         raise ArgumentError(f"scene spec '{spec}': expected {_FORMS}.{_did_you_mean(base)}")
     split, first, end, index = match.groups()
-    numbers = range(int(first or 0), int(end or SPLIT_SIZE))
+    numbers = range(_to_number(spec, first or "0"), _to_number(spec, end) if end else SPLIT_SIZE)
     if not numbers:
         raise ArgumentError(f"scene spec '{spec}': holds no scene; expected first < end, as in apartments:val:40:60.")
     if index is not None:
-        return [base + mark + "&".join(_parse_edits(spec, edits))] if mark else [spec]
+        single = f"apartments:{split}/{_to_number(spec, index)}"
+        return [single + mark + "&".join(_parse_edits(spec, edits))] if mark else [single]
     if mark:
         raise ArgumentError(f"scene spec '{spec}': edits belong to a single apartment; expected {_FORMS}.")
     return [f"apartments:{split}/{i}" for i in numbers]
+
+
+def _to_number(spec: str, digits: str) -> int:
+    digits = digits.lstrip("0") or "0"
+    if len(digits) > MOST_DIGITS:
+        raise ArgumentError(f"scene spec '{spec}': expected numbers below {10**MOST_DIGITS}, got {digits}.")
+    return int(digits)
 
 
 def _resembles_generated(spec: str) -> bool:
@@ -102,7 +112,7 @@ def parse_single(spec: str) -> tuple[int, str, list[str]]:
     match = re.fullmatch(APARTMENTS, base)
     if match is None or match[4] is None:
         raise ArgumentError(f"scene spec '{spec}': expected a single apartment, such as apartments:val/7.")
-    return int(match[4]), match[1], _parse_edits(spec, edits) if mark else []
+    return _to_number(spec, match[4]), match[1], _parse_edits(spec, edits) if mark else []
 
 
 def _did_you_mean(spec: str) -> str:

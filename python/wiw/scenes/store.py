@@ -32,6 +32,8 @@ _log = logging.getLogger("wiw.scenes")
 _CHUNK = 1 << 20
 LIMIT_GB = 8.0
 """Most gigabytes that scenes may take; an apartment takes 15 MB. `$WIW_CACHE_GB` sets another limit."""
+DRAFT_LIFETIME = 24 * 3600
+"""Seconds after which nobody can be writing a draft any more."""
 
 
 @dataclass(frozen=True)
@@ -69,17 +71,19 @@ def load_imported(source: Path, options: dict[str, Any], build: Callable[[Path],
     started = time.time_ns()
     try:
         sources = build(draft)
+        built = _core.scene.map_cache(draft)  # before another process can see the scene and trim it
         entries = [_entry(path) for path in dict.fromkeys(sources.read)]
         names = [os.path.relpath(entry["path"], source.absolute().parent) for entry in entries]
         scene = folder() / f"{_key([names, [entry['digest'] for entry in entries], options])}.wiwscene"
         draft.replace(scene)
     finally:
-        draft.unlink(missing_ok=True)
+        for path in (draft, *draft.parent.glob(f"{draft.name}.*")):  # a killed importer leaves a draft of the draft
+            path.unlink(missing_ok=True)
     _trim(scene)
     if all(entry["mtime_ns"] < started for entry in entries):  # else a file may have changed while it was read
         absent = [str(path.absolute()) for path in dict.fromkeys(sources.absent)]
         _write(manifest, {"scene": scene.name, "read": entries, "absent": absent})
-    return _core.scene.map_cache(scene)
+    return built
 
 
 def temporary(build: Callable[[Path], Any]) -> _core.scene.Scene:
@@ -177,7 +181,11 @@ def _map_scene(path: Path) -> _core.scene.Scene | None:
 
 
 def _trim(newest: Path) -> None:
-    """Remove scenes, those unused for longest first, until the others fit the limit; never `newest`."""
+    """Remove scenes, those unused for longest first, until the others fit the limit; never `newest`.
+
+    Drafts that killed processes left go too.
+    """
+    _remove_abandoned_drafts(newest.parent)
     scenes = []
     for path in newest.parent.glob("*.wiwscene"):
         with suppress(FileNotFoundError):  # another process trims as well
@@ -188,6 +196,13 @@ def _trim(newest: Path) -> None:
         if excess > 0 and path != newest:
             path.unlink(missing_ok=True)
             excess -= size
+
+
+def _remove_abandoned_drafts(place: Path) -> None:
+    for path in place.glob("*.tmp"):
+        with suppress(OSError):  # another process removes them as well
+            if time.time() - path.stat().st_mtime > DRAFT_LIFETIME:
+                path.unlink()
 
 
 def _key(parts: list[Any]) -> str:

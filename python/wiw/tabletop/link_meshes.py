@@ -3,7 +3,7 @@
 
 from __future__ import annotations
 
-from functools import cache
+from functools import lru_cache
 from typing import Any
 
 import numpy as np
@@ -14,9 +14,11 @@ from wiw.tabletop.shapes import Mesh, build_mesh, merge_meshes, paint_mesh
 
 LinkMeshes = tuple[tuple[int, Mesh], ...]
 """(link, mesh in the link's frame) of every visible link."""
+CACHED_ROBOTS = 64
+"""Articulations whose meshes are kept, those used last."""
 
 
-@cache
+@lru_cache(CACHED_ROBOTS)
 def build_link_meshes(robot: Articulation) -> LinkMeshes:
     """Return (link, mesh in the link's frame) for every visible link; primitives get rounded edges.
 

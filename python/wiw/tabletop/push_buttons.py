@@ -4,6 +4,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from functools import cache
 from itertools import permutations
 from typing import Any
 
@@ -143,8 +144,9 @@ def _score_lamps(front: NDArray[np.uint8], button: Pose) -> NDArray[np.float64]:
     return lights / max(1.0, lights.sum())
 
 
+@cache
 def _build_button(colour: tuple[float, float, float]) -> Articulation:
-    """Build a plate on a spring in a dark ring."""
+    """Build a plate on a spring in a dark ring; buttons of one colour share it, and with it its meshes."""
     rgba = " ".join(f"{value}" for value in (*colour, 1.0))
     return Articulation.from_text(_URDF.format(rgba=rgba, dark=" ".join(map(str, UNLIT_COLOUR)), ring=RING, high=HIGH))
 

@@ -451,6 +451,32 @@ def test_a_scene_forgotten_by_the_cache_is_imported_again_without_a_word(
     assert not caplog.text
 
 
+def test_drafts_of_killed_imports_are_removed(tmp_path: Path, own_cache: Path) -> None:
+    place = own_cache / "scenes"
+    place.mkdir(parents=True)
+    old, new = place / "1.2.tmp.77-0.tmp", place / "1.3.tmp"
+    old.touch()
+    new.touch()
+    os.utime(old, times=(0, time.time() - 25 * 3600))
+    scenes.load(square(tmp_path), isolate=False)
+    assert new.exists() and not old.exists()
+
+    def end_half_way(path: Path) -> scenes.store.Sources:
+        path.with_name(f"{path.name}.77-0.tmp").touch()
+        raise FileError("crashed on it")
+
+    with pytest.raises(FileError, match="crashed"):
+        scenes.store.load_imported(tmp_path / "square.glb", {"other": 1}, end_half_way)
+    assert list(place.glob("*.tmp")) == [new]
+
+
+def test_a_scene_trimmed_by_another_process_at_once_is_used_all_the_same(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(scenes.store, "_trim", lambda newest: newest.unlink())
+    assert scenes.load(square(tmp_path), isolate=False).triangle_count == 2
+
+
 def test_a_scene_that_cannot_be_kept_is_used_all_the_same(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
 ) -> None:
@@ -511,6 +537,12 @@ def test_resolve_names_scenes(tmp_path: Path) -> None:
     for spec in ("apartments:test:62:60", "apartments:test:7:7", "apartments:test:1:2:3", "apartments:test:-1:3"):
         with pytest.raises(ArgumentError, match="val:40:60"):
             scenes.resolve(spec)
+    assert scenes.resolve("apartments:test/999999") == ["apartments:test/999999"]
+    for spec in ("apartments:test/1000000", "apartments:test:1000000", f"apartments:test:{'9' * 5000}:1"):
+        with pytest.raises(ArgumentError, match="expected numbers below 1000000"):
+            scenes.resolve(spec)
+    with pytest.raises(ArgumentError, match="expected numbers below 1000000"):
+        scenes.open_scene("apartments:test/18446744073709551616")
     mesh = str(square(tmp_path))
     assert scenes.resolve(mesh) == [mesh]
     with pytest.raises(ArgumentError, match="expected apartments"):

@@ -9,7 +9,8 @@ import pytest
 
 from wiw.errors import ArgumentError
 from wiw.physics import place
-from wiw.tabletop.base import is_holding
+from wiw.tabletop.base import PALETTE, is_holding
+from wiw.tabletop.link_meshes import build_link_meshes
 from wiw.tabletop.tasks import TABLETOP_TASKS, find_task
 from wiw.tabletop.workbench import TABLE, Workbench
 from wiw.types import ArmObservation
@@ -105,6 +106,13 @@ def test_what_is_left_of_a_row_of_buttons_shows() -> None:
     assert kind.find_remaining_target(now, setup.target) == tuple(rest)
     assert kind.find_remaining_target(now, (first,)) is None
     assert kind.find_remaining_target(now, (rest[0], first)) is None
+
+
+def test_tables_of_buttons_share_what_they_are_made_of() -> None:
+    kind = TABLETOP_TASKS["push_buttons"]
+    mechanisms = {thing.mechanism for seed in range(40) for thing, _ in kind.create_setup(seed, seed).things}
+    assert len(mechanisms) <= len(PALETTE)
+    assert build_link_meshes.cache_info().maxsize is not None
 
 
 def test_what_is_held_is_told_by_the_fingers() -> None:
