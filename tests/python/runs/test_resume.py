@@ -47,9 +47,9 @@ def test_a_run_is_resumed_with_another_deadline_and_cache(tmp_path, two_rooms, m
     deadlines = []
     made = Attempted.__init__
 
-    def record(self, model, deadline=300.0):
+    def record(self, model, deadline=300.0, **options):
         deadlines.append(deadline)
-        made(self, model, deadline)
+        made(self, model, deadline, **options)
 
     monkeypatch.setattr(Attempted, "__init__", record)
     (tmp_path / "is_slow").unlink()
