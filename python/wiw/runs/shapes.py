@@ -18,7 +18,7 @@ NUMBER = (int, float, type(None))
 TEXT, FLAG = (str,), (bool,)
 WHOLE = (int,)
 NONE = (type(None),)
-FINITE = (int, float)
+FINITE = (int, float, bool)
 NUMBERS = {str: (*NUMBER, bool)}
 """Names to numbers."""
 

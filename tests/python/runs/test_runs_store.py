@@ -252,7 +252,7 @@ def test_a_store_without_a_column_of_its_schema_is_refused(run, tmp_path, versio
     ("statement", "message"),
     [
         ("UPDATE outcome SET arm = 'mine'", r"outcome \(arm mine, episode 0\): expected an arm of the run: none, warp"),
-        ("UPDATE outcome SET metrics = '{\"success\": null}'", "metrics: success: expected int or float, got NoneType"),
+        ("UPDATE outcome SET metrics = '{\"success\": null}'", "success: expected int or float or bool, got NoneType"),
         ("UPDATE run SET info = json_set(info, '$.tables', 5)", "info: tables: expected dict, got int"),
         ("UPDATE run SET info = json_set(info, '$.tables.cuts', 'x')", r"info: tables\.cuts: expected list, got str"),
         ("UPDATE run SET info = json_set(info, '$.departures', json('[\"x\"]'))", r"departures\[0\]: expected dict"),
@@ -267,6 +267,14 @@ def test_a_store_edited_by_hand_is_refused_by_its_summary(run, tmp_path, stateme
         other.execute(statement)
     with pytest.raises(StoreError, match=f"{message}.*edited: restore it"):
         load_run(tmp_path / "run").numbers()
+
+
+def test_a_success_may_be_a_truth_value(run, tmp_path):
+    """Tasks of users may give one."""
+    for arm, success in (("none", False), ("warp", True)):
+        run.write(outcome_row(arm, make_result(0, success=success)))
+    found = load_run(tmp_path / "run").numbers()
+    assert found["warp"].estimates["success"].value == 100.0 and found["none"].estimates["success"].value == 0.0
 
 
 def test_metrics_that_are_not_finite_are_summarised_as_such(run, tmp_path):
