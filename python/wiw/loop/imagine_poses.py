@@ -67,8 +67,9 @@ def imagine_poses(model: WorldModel, request: Request) -> ImaginedPoses:
         with clock("world_model"):
             found = ask(model, observations, controls, seeds)
         if request.retouch is not None:
-            lengths, shared = [own.length for own in controls], [own.shared for own in controls]
-            found = request.retouch(Answer(found, seeds, 0, lengths, shared, accepts.view))
+            with clock("platform"):
+                lengths, shared = [own.length for own in controls], [own.shared for own in controls]
+                found = request.retouch(Answer(found, seeds, 0, lengths, shared, accepts.view))
         for i, own in zip(part, found, strict=True):
             answers[i] = own[_find_frames(rows[i], request.frames.ends)]
     with clock("platform"):
