@@ -4,6 +4,7 @@
 #include <pybind11/stl.h>
 
 #include "arrays.hpp"
+#include "gil.hpp"
 #include "wiw/annotate/strip.hpp"
 
 namespace py = pybind11;
@@ -54,7 +55,7 @@ py::array strip(const Pixels& frames, const std::vector<std::string>& titles, in
   py::array_t<std::uint8_t> out({size.height, size.width, 3});
   std::uint8_t* to = out.mutable_data();
   const std::uint8_t* from = frames.data();
-  const py::gil_scoped_release release;
+  const wiw::bindings::GilRelease release;
   draw_strip(from, frame, titles, style, to);
   return out;
 }

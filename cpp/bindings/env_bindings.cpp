@@ -4,6 +4,7 @@
 #include <pybind11/stl.h>
 
 #include "actions.hpp"
+#include "gil.hpp"
 #include "wiw/env/vector_env.hpp"
 
 namespace py = pybind11;
@@ -54,7 +55,7 @@ struct Outlook {
 py::dict draw(const NavigationEnv& env, const std::vector<std::string>& outputs) {
   Images images(env.config(), outputs, 0);
   {
-    const py::gil_scoped_release release;
+    const wiw::bindings::GilRelease release;
     env.observe(images.targets);
   }
   return images.arrays;
@@ -135,7 +136,7 @@ void bind_env(py::module_& module) {
             py::array_t<bool> moved(static_cast<py::ssize_t>(envs.size()));
             const std::span<bool> view(moved.mutable_data(), envs.size());
             {
-              const py::gil_scoped_release release;
+              const wiw::bindings::GilRelease release;
               envs.step(actions, view);
             }
             return moved;
@@ -146,7 +147,7 @@ void bind_env(py::module_& module) {
           [](VectorEnv& envs, const std::vector<std::string>& outputs) {
             Images images(envs.env(0).config(), outputs, static_cast<py::ssize_t>(envs.size()));
             {
-              const py::gil_scoped_release release;
+              const wiw::bindings::GilRelease release;
               envs.observe(images.targets);
             }
             return images.arrays;

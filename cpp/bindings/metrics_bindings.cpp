@@ -5,6 +5,7 @@
 #include <cmath>
 
 #include "arrays.hpp"
+#include "gil.hpp"
 #include "wiw/core/thread_pool.hpp"
 #include "wiw/metrics/pose_error.hpp"
 #include "wiw/metrics/psnr.hpp"
@@ -53,7 +54,7 @@ Doubles compare(const Array<T>& a, const Array<T>& b, double range, const std::s
   const T* to = b.data();
   double* out = values.mutable_data();
   {
-    const py::gil_scoped_release release;
+    const wiw::bindings::GilRelease release;
     parallel_for(count, [&](std::size_t i) {
       const ImageView<const T> left{from + i * stride, size, channels};
       const ImageView<const T> right{to + i * stride, size, channels};

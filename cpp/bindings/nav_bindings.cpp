@@ -10,6 +10,7 @@
 #include <optional>
 
 #include "arrays.hpp"
+#include "gil.hpp"
 #include "wiw/nav/distance_field.hpp"
 #include "wiw/nav/ground.hpp"
 #include "wiw/nav/nav_mesh.hpp"
@@ -91,7 +92,7 @@ Metric to_metric(const std::string& name) {
 py::array_t<float> snap(const NavMesh& mesh, const Array<float>& array) {
   Points points = to_points(array, "points");
   {
-    const py::gil_scoped_release release;
+    const wiw::bindings::GilRelease release;
     const Eigen::Vector3f nowhere = Eigen::Vector3f::Constant(std::numeric_limits<float>::quiet_NaN());
     for (Eigen::Vector3f& point : points.values) point = mesh.snap(point).value_or(nowhere);
   }
@@ -102,7 +103,7 @@ py::object is_navigable(const NavMesh& mesh, const Array<float>& array, float ma
   const Points points = to_points(array, "points");
   std::vector<std::uint8_t> result;
   {
-    const py::gil_scoped_release release;
+    const wiw::bindings::GilRelease release;
     for (const Eigen::Vector3f& point : points.values) result.push_back(mesh.is_navigable(point, max_dy));
   }
   if (points.single) return py::bool_(result[0] != 0);
@@ -115,7 +116,7 @@ py::object island_of(const NavMesh& mesh, const Array<float>& array) {
   const Points points = to_points(array, "points");
   std::vector<std::int64_t> result;
   {
-    const py::gil_scoped_release release;
+    const wiw::bindings::GilRelease release;
     for (const Eigen::Vector3f& point : points.values) result.push_back(mesh.island_of(point));
   }
   return value_array(points.single, result);
@@ -136,7 +137,7 @@ py::array_t<float> sample(const NavMesh& mesh, std::size_t count, std::uint64_t 
   const int index = to_island(mesh, island);
   std::vector<Eigen::Vector3f> points;
   {
-    const py::gil_scoped_release release;
+    const wiw::bindings::GilRelease release;
     points = mesh.sample(count, seed, index);
   }
   return point_array(points, {static_cast<py::ssize_t>(count), 3});
@@ -146,7 +147,7 @@ py::array_t<float> try_step(const NavMesh& mesh, const Array<float>& start, cons
   const Pairs pairs = to_pairs(start, "start", end, "end");
   std::vector<Eigen::Vector3f> reached(pairs.size());
   {
-    const py::gil_scoped_release release;
+    const wiw::bindings::GilRelease release;
     for (std::size_t i = 0; i < reached.size(); ++i) {
       reached[i] = mesh.try_step(pairs.first(i), pairs.second(i), sliding);
     }
@@ -161,7 +162,7 @@ py::object geodesic_distance(const NavMesh& mesh, const Array<float>& a, const A
   std::vector<double> metres(pairs.size());
   std::vector<std::string> reasons(pairs.size());
   {
-    const py::gil_scoped_release release;
+    const wiw::bindings::GilRelease release;
     for (std::size_t i = 0; i < metres.size(); ++i) {
       const Distance distance = mesh.geodesic_distance(pairs.first(i), pairs.second(i), metric);
       metres[i] = distance.metres;
@@ -180,7 +181,7 @@ py::object shortest_path(const NavMesh& mesh, const Array<float>& a, const Array
   const Metric metric = to_metric(metric_name);
   Path path;
   {
-    const py::gil_scoped_release release;
+    const wiw::bindings::GilRelease release;
     path = mesh.shortest_path(start.values[0], end.values[0], metric);
   }
   if (path.reason != NoPathReason::kNone) {
@@ -193,7 +194,7 @@ py::object shortest_path(const NavMesh& mesh, const Array<float>& a, const Array
 
 double surface_length(const NavMesh& mesh, const Array<float>& array, float step) {
   const Points points = to_points(array, "points");
-  const py::gil_scoped_release release;
+  const wiw::bindings::GilRelease release;
   return mesh.surface_length(points.values, step);
 }
 
@@ -203,7 +204,7 @@ py::array_t<double> distance_matrix(const NavMesh& mesh, const Array<float>& arr
   const auto n = static_cast<py::ssize_t>(points.values.size());
   auto metres = std::make_unique<std::vector<double>>();
   {
-    const py::gil_scoped_release release;
+    const wiw::bindings::GilRelease release;
     *metres = mesh.distance_matrix(points.values, metric);
   }
   const double* data = metres->data();
@@ -216,7 +217,7 @@ py::object field_distance(const DistanceField& field, const Array<float>& array,
   std::vector<double> metres;
   std::vector<std::string> reasons;
   {
-    const py::gil_scoped_release release;
+    const wiw::bindings::GilRelease release;
     for (const Eigen::Vector3f& point : points.values) {
       const Distance distance = field.distance(point);
       metres.push_back(distance.metres);
@@ -233,7 +234,7 @@ py::object select_among(const Array<double>& distances, double mean_weight, doub
   const auto n = static_cast<std::size_t>(distances.shape(0));
   RankedPlaces places;
   {
-    const py::gil_scoped_release release;
+    const wiw::bindings::GilRelease release;
     places = select_waypoints(std::span(distances.data(), n * n), n, {.mean_weight = mean_weight, .spacing = spacing});
   }
   const std::vector<std::int64_t> index(places.index.begin(), places.index.end());
@@ -245,7 +246,7 @@ py::array_t<float> select_on_mesh(const NavMesh& mesh, std::uint64_t seed, doubl
   const WaypointOptions options{density, min_samples, mean_weight, spacing, to_metric(metric)};
   std::vector<Eigen::Vector3f> points;
   {
-    const py::gil_scoped_release release;
+    const wiw::bindings::GilRelease release;
     points = select_waypoints(mesh, seed, options);
   }
   return point_array(points, {static_cast<py::ssize_t>(points.size()), 3});
@@ -268,7 +269,7 @@ std::shared_ptr<NavMesh> from_triangles(const Array<float>& vertices, const py::
       triangle[k] = static_cast<std::uint32_t>(*index);
     }
   }
-  const py::gil_scoped_release release;
+  const wiw::bindings::GilRelease release;
   return NavMesh::from_triangles(points.values, triangles, settings);
 }
 
@@ -314,7 +315,7 @@ Lengths in metres, angles in degrees; the defaults are Habitat's. `region_min_si
 py::array_t<float> on_ground(const Ground& ground, const Array<float>& array) {
   Points points = to_points(array, "points");
   {
-    const py::gil_scoped_release release;
+    const wiw::bindings::GilRelease release;
     for (Eigen::Vector3f& point : points.values) {
       point.y() = static_cast<float>(ground.height(point.cast<double>()));
     }
@@ -327,7 +328,7 @@ void bind_ground(py::module_& module) {
 
 Recast rounds floors up by as much as a cell (0.2 m at Habitat's settings): points on a navigation mesh lie above the
 floor, by another amount in every scene. What stands or is seen from there has to be put down first.)")
-      .def(py::init<const scene::Scene&>(), py::arg("scene"), py::call_guard<py::gil_scoped_release>())
+      .def(py::init<const scene::Scene&>(), py::arg("scene"), py::call_guard<wiw::bindings::GilRelease>())
       .def("put_down", &on_ground, py::arg("points"),
            "float32 [N, 3] (or [3]): points of a navigation mesh (metres) with the floor's height; the highest surface "
            "from 0.45 m below to 0.1 m above counts. Points without any stay where they are, NaN included.");
@@ -335,7 +336,7 @@ floor, by another amount in every scene. What stands or is seen from there has t
 
 void bind_construction(py::class_<NavMesh, std::shared_ptr<NavMesh>>& mesh) {
   mesh.def_static("build", &NavMesh::build, py::arg("scene"), py::arg("settings") = NavMeshSettings{},
-                  py::call_guard<py::gil_scoped_release>(),
+                  py::call_guard<wiw::bindings::GilRelease>(),
                   "Navigation mesh of a `wiw.scenes` scene. ArgumentError if nothing in it is walkable.");
   mesh.def_static("from_triangles", &from_triangles, py::arg("vertices"), py::arg("faces"),
                   py::arg("settings") = NavMeshSettings{},
@@ -343,12 +344,12 @@ void bind_construction(py::class_<NavMesh, std::shared_ptr<NavMesh>>& mesh) {
                   "counter-clockwise from above where one can walk.");
   mesh.def_static(
       "load", [](const std::filesystem::path& path) { return NavMesh::load(path.string()); }, py::arg("path"),
-      py::call_guard<py::gil_scoped_release>(),
+      py::call_guard<wiw::bindings::GilRelease>(),
       "Reads a Habitat `.navmesh` file, version 1 or 2. FileError names the file and what is wrong with it.");
   mesh.def(
       "save",
       [](const NavMesh& self, const std::filesystem::path& path, int version) { self.save(path.string(), version); },
-      py::arg("path"), py::arg("version") = 2, py::call_guard<py::gil_scoped_release>(),
+      py::arg("path"), py::arg("version") = 2, py::call_guard<wiw::bindings::GilRelease>(),
       "Writes a Habitat `.navmesh` file; version 1 leaves the settings out.");
 }
 
@@ -424,7 +425,7 @@ void bind_fields(py::module_& module, py::class_<NavMesh, std::shared_ptr<NavMes
       "distances_from",
       [](const std::shared_ptr<NavMesh>& self, const Array<float>& array) {
         const Points goals = to_points(array, "goals");
-        const py::gil_scoped_release release;
+        const wiw::bindings::GilRelease release;
         return DistanceField(self, goals.values);
       },
       py::arg("goals"),

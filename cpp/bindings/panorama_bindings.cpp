@@ -6,6 +6,7 @@
 #include <memory>
 
 #include "arrays.hpp"
+#include "gil.hpp"
 #include "wiw/core/thread_pool.hpp"
 #include "wiw/panorama/cubemap.hpp"
 #include "wiw/panorama/perspective.hpp"
@@ -86,7 +87,7 @@ py::array apply_plan(const PerspectivePlan& plan, const py::array& panoramas, co
                          given);
     const T* from = batch.array.data();
     T* to = out.mutable_data();
-    const py::gil_scoped_release release;
+    const wiw::bindings::GilRelease release;
     plan.apply(from, batch.count, batch.channels, yaws, interpolation, to);
     return out;
   });
@@ -120,7 +121,7 @@ struct CubePlan {
       py::array_t<T> out({static_cast<py::ssize_t>(batch.count), static_cast<py::ssize_t>(target.height),
                           static_cast<py::ssize_t>(target.width), static_cast<py::ssize_t>(batch.channels)});
       T* to = out.mutable_data();
-      const py::gil_scoped_release release;
+      const wiw::bindings::GilRelease release;
       if (interpolation == Interpolation::kNearest) {
         remap_batch(nearest, batch, source, to);
       } else if constexpr (std::is_same_v<T, std::uint32_t>) {
@@ -145,7 +146,7 @@ py::array rotate_batch(const py::array& panoramas, double yaw_deg, const std::st
     const ImageBatch<T> batch(panoramas);
     py::array_t<T> out(std::vector<py::ssize_t>(panoramas.shape(), panoramas.shape() + 4));
     T* to = out.mutable_data();
-    const py::gil_scoped_release release;
+    const wiw::bindings::GilRelease release;
     parallel_for(batch.count, [&](std::size_t b) {
       rotate(batch[b], radians(yaw_deg), interpolation,
              to + b * batch.size.pixels() * static_cast<std::size_t>(batch.channels));
@@ -165,7 +166,7 @@ py::array resize_batch(const py::array& images, const Pair& size_pair) {
       py::array_t<T> out({static_cast<py::ssize_t>(batch.count), static_cast<py::ssize_t>(size.height),
                           static_cast<py::ssize_t>(size.width), static_cast<py::ssize_t>(batch.channels)});
       T* to = out.mutable_data();
-      const py::gil_scoped_release release;
+      const wiw::bindings::GilRelease release;
       parallel_for(batch.count, [&](std::size_t b) {
         resize_area(batch[b], size, to + b * size.pixels() * static_cast<std::size_t>(batch.channels));
       });
@@ -179,7 +180,7 @@ py::array_t<float> direction_map(const Pair& size_pair) {
   check_panorama_size(size);
   py::array_t<float> out({size.height, size.width, 3});
   float* to = out.mutable_data();
-  const py::gil_scoped_release release;
+  const wiw::bindings::GilRelease release;
   directions(size, to);
   return out;
 }
@@ -192,7 +193,7 @@ void bind_panorama(py::module_& module) {
       .def(py::init([](const Pair& panorama, const Pair& size, double hfov_deg, double pitch_deg, bool pixel_centers) {
              const auto convention = pixel_centers ? FovConvention::kPixelCenters : FovConvention::kPixelEdges;
              const PerspectiveView view{to_size(size), radians(hfov_deg), radians(pitch_deg), convention};
-             const py::gil_scoped_release release;
+             const wiw::bindings::GilRelease release;
              return std::make_shared<PerspectivePlan>(to_size(panorama), view);
            }),
            py::arg("pano_size"), py::arg("size"), py::arg("hfov_deg"), py::arg("pitch_deg") = 0.0,
@@ -201,7 +202,7 @@ void bind_panorama(py::module_& module) {
            py::arg("out") = py::none(), "[B, H, W, C] -> [B, yaws, h, w, C]; yaw positive to the left.");
   py::class_<CubePlan>(module, "CubePlan", "Cached look-up between panoramas and cube maps of fixed sizes.")
       .def(py::init<const Pair&, int, bool>(), py::arg("pano_size"), py::arg("face_size"), py::arg("to_cube"),
-           py::call_guard<py::gil_scoped_release>())
+           py::call_guard<wiw::bindings::GilRelease>())
       .def("__call__", &CubePlan::apply, py::arg("images"), py::arg("interpolation") = "bilinear",
            "[B, H, W, C] -> [B, 6 S, S, C] (to_cube), or the other way.");
   module.def("rotate", &rotate_batch, py::arg("panoramas"), py::arg("yaw_deg"), py::arg("interpolation") = "bilinear",

@@ -8,6 +8,7 @@
 #include <set>
 
 #include "arrays.hpp"
+#include "gil.hpp"
 #include "physics_arrays.hpp"
 #include "physics_parts.hpp"
 #include "wiw/physics/articulation.hpp"
@@ -57,7 +58,7 @@ py::array rows(const std::vector<Row>& values) {
 
 py::dict read_surface(const std::filesystem::path& path, const Eigen::Vector3d& scale, const std::string& link) {
   const VisualMesh surface = [&] {
-    const py::gil_scoped_release release;
+    const wiw::bindings::GilRelease release;
     return surface_of_file(path, scale, link);
   }();
   py::dict all;
@@ -103,7 +104,7 @@ py::dict limits(const Articulation& articulation) {
 IkResult solve(const InverseKinematics& ik, const Array<double>& pose, const Eigen::VectorXd& start,
                double position_tolerance, double rotation_tolerance, int iterations, int restarts, std::uint64_t seed) {
   const Pose target = to_pose(pose, "T_base_link");
-  const py::gil_scoped_release release;
+  const wiw::bindings::GilRelease release;
   return ik.solve(target, start, {position_tolerance, rotation_tolerance, iterations, restarts, seed});
 }
 
@@ -151,7 +152,7 @@ shared between worlds and threads.)")
       .def(py::init([](const std::filesystem::path& path) {
              return std::const_pointer_cast<Articulation>(Articulation::load(path));
            }),
-           py::arg("path"), py::call_guard<py::gil_scoped_release>(),
+           py::arg("path"), py::call_guard<wiw::bindings::GilRelease>(),
            "Reads a URDF file. FileError for a file or mesh that is missing or damaged (the message names the link), "
            "ArgumentError for impossible numbers and other joints. `package://NAME/...` is looked for in the folders "
            "above the file. It is read in this process; `wiw.tabletop.robot.robot_of` reads files of others in one of "
@@ -161,7 +162,7 @@ shared between worlds and threads.)")
           [](const std::string& urdf, const std::filesystem::path& folder) {
             return std::const_pointer_cast<Articulation>(Articulation::parse(urdf, folder));
           },
-          py::arg("urdf"), py::arg("folder") = std::filesystem::path(), py::call_guard<py::gil_scoped_release>(),
+          py::arg("urdf"), py::arg("folder") = std::filesystem::path(), py::call_guard<wiw::bindings::GilRelease>(),
           "The same from text; mesh files are relative to `folder`.")
       .def("to_parts", &bindings::articulation_to_parts,
            "All of it as plain data that JSON can hold to the last bit, for `from_parts`.")

@@ -6,6 +6,7 @@
 #include <pybind11/stl/filesystem.h>
 
 #include "arrays.hpp"
+#include "gil.hpp"
 #include "physics_arrays.hpp"
 #include "wiw/physics/gripper.hpp"
 #include "wiw/physics/inverse_kinematics.hpp"
@@ -23,7 +24,7 @@ void bind_physics_articulation(py::module_& module);
 
 namespace {
 
-using Unlocked = py::call_guard<py::gil_scoped_release>;
+using Unlocked = py::call_guard<wiw::bindings::GilRelease>;
 
 /// One part: a shape in the body's own frame, or (shape, T_body_part).
 Part to_part(const py::handle& value) {
@@ -65,7 +66,7 @@ py::array_t<double> path_joints(const LinearPath& path) {
 LinearPath plan(World& world, const Array<double>& pose, int articulation, const std::string& link,
                 const Touchable& allowed, const LinearPathOptions& options) {
   const Pose target = to_pose(pose, "T_world_link");
-  const py::gil_scoped_release release;
+  const wiw::bindings::GilRelease release;
   const int index = world.articulation(articulation)->link_index(link);
   return plan_linear(world, articulation, index, target, allowed, options);
 }

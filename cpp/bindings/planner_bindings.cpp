@@ -6,6 +6,7 @@
 #include <memory>
 
 #include "actions.hpp"
+#include "gil.hpp"
 #include "wiw/planner/assemble.hpp"
 
 namespace py = pybind11;
@@ -193,7 +194,7 @@ py::array_t<std::uint8_t> views(const BoundBatch& self, const py::iterable& pano
   py::array_t<std::uint8_t> images = output(out, shape);
   const MakeViews make = dense ? &make_dense_views : &make_views;
   std::uint8_t* pixels = images.mutable_data();
-  const py::gil_scoped_release release;
+  const wiw::bindings::GilRelease release;
   make(self.batch, self.index, real.images, answers.imagination, maker, pixels);
   return images;
 }
@@ -208,7 +209,7 @@ py::array_t<std::uint8_t> ends(const BoundBatch& self, const Array<std::int64_t>
       index_ends(self.batch, std::span(candidates.data(), static_cast<std::size_t>(candidates.size())));
   py::array_t<std::uint8_t> images(with_view_shape({candidates.size()}, maker));
   std::uint8_t* pixels = images.mutable_data();
-  const py::gil_scoped_release release;
+  const wiw::bindings::GilRelease release;
   make_views(self.batch, index, real.images, answers.imagination, maker, pixels);
   return images;
 }
@@ -227,7 +228,7 @@ py::array_t<std::uint8_t> observations(const BoundBatch& self, const py::iterabl
   expect_episodes(self.batch, real.arrays.size());
   py::array_t<std::uint8_t> images(with_view_shape({static_cast<py::ssize_t>(self.batch.rows().size())}, maker));
   std::uint8_t* pixels = images.mutable_data();
-  const py::gil_scoped_release release;
+  const wiw::bindings::GilRelease release;
   make_observations(self.batch, real.images, maker, pixels);
   return images;
 }
@@ -239,7 +240,7 @@ py::array_t<float> depths(const BoundBatch& self, const py::iterable& distances,
                              static_cast<py::ssize_t>(maker.spec().size.height),
                              static_cast<py::ssize_t>(maker.spec().size.width)});
   float* pixels = images.mutable_data();
-  const py::gil_scoped_release release;
+  const wiw::bindings::GilRelease release;
   make_depths(self.batch, real.images, maker, pixels);
   return images;
 }
@@ -337,7 +338,7 @@ void bind_batch(py::module_& module) {
           "build",
           [](const py::sequence& plans, const ModelSpec& spec) {
             const Plans candidates = plans_of(plans);
-            const py::gil_scoped_release release;
+            const wiw::bindings::GilRelease release;
             Batch batch(candidates, spec);
             ViewIndex index = index_views(batch);
             return BoundBatch{std::move(batch), std::move(index)};

@@ -5,6 +5,7 @@
 #include <optional>
 
 #include "arrays.hpp"
+#include "gil.hpp"
 #include "wiw/render/gpu/gpu_renderer.hpp"
 #include "wiw/render/renderer.hpp"
 
@@ -50,7 +51,7 @@ void render(Renderer& renderer, const Array<double>& T_world_camera, const wiw::
   targets.color = target<std::uint8_t>(color, {batch, height, width, 3}, "color uint8 [B, H, W, 3]");
   targets.depth = target<float>(depth, {batch, height, width}, "depth float32 [B, H, W]");
   targets.instance = target<std::uint32_t>(instance, {batch, height, width}, "instance uint32 [B, H, W]");
-  const py::gil_scoped_release release;
+  const wiw::bindings::GilRelease release;
   renderer.render(poses, camera, targets);
 }
 
@@ -67,14 +68,14 @@ void set_poses(Renderer& renderer, const Array<std::uint32_t>& ids, const Array<
     transforms[i].matrix() = matrix;
   }
   const std::span<const std::uint32_t> id_span(ids.data(), transforms.size());
-  const py::gil_scoped_release release;
+  const wiw::bindings::GilRelease release;
   renderer.set_poses(id_span, transforms);
 }
 
 py::list egl_devices() {
   std::vector<wiw::render::EglDeviceReport> reports;
   {
-    const py::gil_scoped_release release;
+    const wiw::bindings::GilRelease release;
     reports = wiw::render::report_egl_devices();
   }
   py::list devices;
@@ -97,7 +98,7 @@ void bind_render(py::module_& module) {
   py::class_<Renderer, std::shared_ptr<Renderer>>(module, "Renderer", "Draws one scene; see wiw.render.Renderer.")
       .def(py::init([](const std::shared_ptr<wiw::scene::Scene>& scene, const std::string& backend, int samples) {
              const wiw::render::Backend chosen = backend_from(backend);
-             const py::gil_scoped_release release;
+             const wiw::bindings::GilRelease release;
              return wiw::render::make_renderer(scene, chosen, {.samples = samples});
            }),
            py::arg("scene"), py::arg("backend"), py::arg("samples"))

@@ -6,6 +6,7 @@
 #include <optional>
 
 #include "arrays.hpp"
+#include "gil.hpp"
 #include "wiw/reproject/warp.hpp"
 
 namespace py = pybind11;
@@ -52,7 +53,7 @@ py::dict run(const Warp& warp, const bindings::Array<std::uint8_t>& color, const
     targets.hole = reinterpret_cast<std::uint8_t*>(out.mutable_data());
     result["hole"] = out;
   }
-  const py::gil_scoped_release release;
+  const wiw::bindings::GilRelease release;
   warp(color.data(), depth.data(), static_cast<std::size_t>(sources), poses, targets);
   return result;
 }

@@ -5,6 +5,7 @@
 #include <string>
 #include <vector>
 
+#include "gil.hpp"
 #include "wiw/apartment/apartment.hpp"
 #include "wiw/apartment/edits.hpp"
 
@@ -18,7 +19,7 @@ void bind_apartment(py::module_& module) {
       "apartment",
       [](std::uint64_t seed, const std::string& split, const Texts& edits) {
         const apartment::Split part = apartment::split_from_name(split);
-        const py::gil_scoped_release release;
+        const wiw::bindings::GilRelease release;
         return std::make_shared<wiw::scene::Scene>(
             apartment::make_apartment(seed, part, apartment::parse_edits(edits)));
       },
@@ -28,7 +29,7 @@ void bind_apartment(py::module_& module) {
       "apartment_outline",
       [](std::uint64_t seed, const std::string& split, const Texts& edits) {
         const apartment::Split part = apartment::split_from_name(split);
-        const py::gil_scoped_release release;
+        const wiw::bindings::GilRelease release;
         return std::make_shared<wiw::scene::Scene>(
             apartment::outline_apartment(seed, part, apartment::parse_edits(edits)));
       },
@@ -38,7 +39,7 @@ void bind_apartment(py::module_& module) {
       "possible_edits",
       [](std::uint64_t seed, const std::string& split, const Texts& edits) {
         const apartment::Split part = apartment::split_from_name(split);
-        const py::gil_scoped_release release;
+        const wiw::bindings::GilRelease release;
         Texts texts;
         for (const apartment::Edit& edit : apartment::possible_edits(seed, part, apartment::parse_edits(edits)))
           texts.push_back(apartment::to_text(edit));

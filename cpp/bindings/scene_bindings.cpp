@@ -11,6 +11,7 @@
 #include <optional>
 
 #include "arrays.hpp"
+#include "gil.hpp"
 #include "scene_builder.hpp"
 #include "wiw/scene/cache.hpp"
 #include "wiw/scene/describe.hpp"
@@ -96,7 +97,7 @@ py::object sun_to_dict(const Scene& scene) {
 py::tuple triangles_to_arrays(const Scene& scene) {
   wiw::scene::TriangleSoup soup;
   {
-    const py::gil_scoped_release release;
+    const wiw::bindings::GilRelease release;
     soup = wiw::scene::world_triangles(scene);
   }
   py::array_t<std::uint32_t> instance(static_cast<py::ssize_t>(soup.instance.size()));
@@ -165,7 +166,7 @@ py::tuple import_scene(const std::filesystem::path& path, const std::optional<st
   set_limits(limits, options.limits);
   ScenePtr scene;
   {
-    const py::gil_scoped_release release;
+    const wiw::bindings::GilRelease release;
     const std::string extension = path.extension().string();
     const bool world = extension == ".world" || extension == ".sdf";
     scene = world ? wiw::scene::load_sdf_world(path, options) : wiw::scene::load_mesh(path, options);
@@ -178,7 +179,7 @@ py::tuple read_ply_surface(const std::filesystem::path& path, const std::string&
   set_limits(limits, most);
   wiw::scene::PlySurface surface;
   {
-    const py::gil_scoped_release release;
+    const wiw::bindings::GilRelease release;
     surface = wiw::scene::read_ply_surface(path, label, most);
   }
   py::array_t<std::int64_t> labels(static_cast<py::ssize_t>(surface.labels.size()));
@@ -254,14 +255,14 @@ void bind_scene(py::module_& module) {
              "axes, triangles uint32 [T, 3], labels int64 [T] and colours uint8 [V, 4] or None.");
   module.attr("IMPORTER_VERSION") = wiw::scene::importer_version();
   module.def("write_cache", &wiw::scene::write_scene_cache, py::arg("scene"), py::arg("path"),
-             py::call_guard<py::gil_scoped_release>(),
+             py::call_guard<wiw::bindings::GilRelease>(),
              "Writes a scene to a cache file, which appears whole or not at all.");
   module.def(
       "map_cache",
       [](const std::filesystem::path& path) {
         return std::const_pointer_cast<Scene>(wiw::scene::map_scene_cache(path));
       },
-      py::arg("path"), py::call_guard<py::gil_scoped_release>(),
+      py::arg("path"), py::call_guard<wiw::bindings::GilRelease>(),
       "Maps a cache file: a scene whose arrays lie in the file. Raises FileError if it is damaged or of another "
       "version.");
 }

@@ -41,6 +41,18 @@ const char* const kRobot = R"(<robot name="crooked">
   <joint name="mount" type="fixed"><parent link="slide"/><child link="tip"/><origin xyz="0 0 0.07" rpy="0 1 0"/></joint>
 </robot>)";
 
+/// A ball joint as it is usual in URDF: three hinges in one place, two links without shape or mass between them.
+const char* const kBall = R"(<robot name="ball">
+  <link name="base"/><link name="x"/><link name="xy"/>
+  <link name="hand"><inertial><mass value="1"/><inertia ixx="0.1" ixy="0" ixz="0" iyy="0.1" iyz="0" izz="0.1"/></inertial></link>
+  <joint name="roll" type="revolute"><parent link="base"/><child link="x"/><axis xyz="1 0 0"/>
+    <limit lower="-1" upper="1" velocity="2" effort="200"/></joint>
+  <joint name="pitch" type="revolute"><parent link="x"/><child link="xy"/><axis xyz="0 1 0"/>
+    <limit lower="-1" upper="1" velocity="2" effort="200"/></joint>
+  <joint name="yaw" type="revolute"><parent link="xy"/><child link="hand"/><axis xyz="0 0 1"/>
+    <limit lower="-1" upper="1" velocity="2" effort="200"/></joint>
+</robot>)";
+
 VectorXd random_positions(const Articulation& robot, Rng& rng) {
   return VectorXd::NullaryExpr(
       robot.dof(), [&](Eigen::Index i) { return rng.uniform(robot.limits().lower[i], robot.limits().upper[i]); });
@@ -145,6 +157,20 @@ TEST_CASE("motors go where they are told, no faster than they may, and stay with
       REQUIRE(q[j] < robot->limits().upper[j] + 0.05);
     }
   }
+}
+
+TEST_CASE("joints of links without shapes have motors and limits, and these links touch nothing") {
+  World world;
+  world.add_articulation(Articulation::parse(kBall));
+  world.add_body({.name = "around it", .parts = {{Sphere{0.2}}}});
+  world.set_joint_targets(0, Vector3d(0.5, 0.5, 0.5));
+  world.step(480);
+  CHECK((world.joint_positions(0) - Vector3d(0.5, 0.5, 0.5)).norm() < 1e-3);
+  CHECK(world.contacts().empty());
+  world.set_joint_forces(0, Vector3d::Zero());
+  world.set_joint_velocities(0, Vector3d(1, -1, 1));
+  world.step(960);
+  CHECK(world.joint_positions(0).cwiseAbs().maxCoeff() < 1.05);
 }
 
 TEST_CASE("inverse kinematics finds poses that there are, and says why it does not find others") {

@@ -1,8 +1,11 @@
 // SPDX-License-Identifier: Apache-2.0
 #include <doctest/doctest.h>
+#include <sys/resource.h>
+#include <unistd.h>
 
 #include <algorithm>
 #include <cmath>
+#include <fstream>
 #include <limits>
 #include <random>
 
@@ -10,6 +13,7 @@
 #include "render/scenes.hpp"
 #include "wiw/core/error.hpp"
 #include "wiw/render/cpu/cpu_renderer.hpp"
+#include "wiw/render/cpu/embree_scene.hpp"
 #include "wiw/render/cpu/record_order.hpp"
 
 using namespace wiw;
@@ -325,3 +329,47 @@ TEST_CASE("an empty batch and no outputs are no work") {
   renderer->render(std::span(&kPose, 1), kView, {});
   CHECK(depth == 5.f);
 }
+
+// The sanitisers' own memory does not stand a limit.
+#if !defined(__SANITIZE_ADDRESS__) && !defined(__SANITIZE_THREAD__)
+namespace {
+
+std::size_t mapped_bytes() {
+  std::size_t pages = 0;
+  std::ifstream("/proc/self/statm") >> pages;
+  return pages * static_cast<std::size_t>(sysconf(_SC_PAGESIZE));
+}
+
+}  // namespace
+
+TEST_CASE("a scene that memory ends for leaves nothing in Embree") {
+  SceneBuilder builder;
+  // Embree copies the first, and has no room for the second.
+  for (const std::size_t vertices : {1000000, 4000000}) {
+    scene::Mesh mesh = make_quad({-1, -1, -2}, {2, 0, 0}, {0, 2, 0});
+    std::vector<Eigen::Vector3f> positions(mesh.positions.begin(), mesh.positions.end());
+    positions.resize(vertices, Eigen::Vector3f::Zero());
+    mesh.positions = positions;
+    builder.add_instance(mesh);
+  }
+  const scene::ScenePtr scene = builder.build();
+  constexpr std::size_t kMegabyte = 1 << 20;
+  const cpu::ShadingScene shading(*scene);
+  const std::size_t before = mapped_bytes();
+  rlimit free{};
+  getrlimit(RLIMIT_AS, &free);
+  const rlimit tight{before + 40 * kMegabyte, free.rlim_max};
+  setrlimit(RLIMIT_AS, &tight);
+  int refused = 0;
+  for (int i = 0; i < 6; ++i) {
+    try {
+      const cpu::EmbreeScene embree(*scene, shading, Isa::kScalar);
+    } catch (const Error&) {
+      ++refused;
+    }
+  }
+  setrlimit(RLIMIT_AS, &free);
+  CHECK(refused == 6);
+  CHECK(mapped_bytes() < before + 24 * kMegabyte);
+}
+#endif

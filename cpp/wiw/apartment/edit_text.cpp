@@ -37,12 +37,12 @@ bool names(const Edit& edit, const std::string& object) {
   return edit.name == object || (edit.kind == EditKind::kSwap && edit.value == object);
 }
 
+}  // namespace
+
 bool contradict(const Edit& a, const Edit& b) {
   const bool shared = names(a, b.name) || (b.kind == EditKind::kSwap && names(a, b.value));
   return shared && (a.kind == b.kind || a.kind == EditKind::kRemove || b.kind == EditKind::kRemove);
 }
-
-}  // namespace
 
 Edit parse_edit(const std::string& text) {
   const std::size_t colon = text.find(':');

@@ -499,15 +499,6 @@ class Editor {
   std::vector<WorldBox> boxes_;  // of shapes, in the world
 };
 
-bool is_used(const Edit& edit, const std::vector<Edit>& applied) {
-  return std::any_of(applied.begin(), applied.end(), [&](const Edit& other) {
-    const bool swap = other.kind == EditKind::kSwap;
-    return other.kind == edit.kind &&
-           (other.name == edit.name ||
-            (swap && (other.name == edit.value || other.value == edit.name || other.value == edit.value)));
-  });
-}
-
 }  // namespace
 
 void apply_edits(Draft& draft, const std::vector<Edit>& edits) {
@@ -517,7 +508,9 @@ void apply_edits(Draft& draft, const std::vector<Edit>& edits) {
 std::vector<Edit> possible_edits(const Draft& draft, const std::vector<Edit>& applied) {
   Draft copy = draft;
   std::vector<Edit> edits = Editor(copy).possible();
-  std::erase_if(edits, [&](const Edit& edit) { return is_used(edit, applied); });
+  std::erase_if(edits, [&](const Edit& edit) {
+    return std::any_of(applied.begin(), applied.end(), [&](const Edit& other) { return contradict(edit, other); });
+  });
   return edits;
 }
 

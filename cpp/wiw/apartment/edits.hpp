@@ -22,6 +22,8 @@ struct Edit {
 /// Throws ArgumentError where the text is no edit.
 Edit parse_edit(const std::string& text);
 std::string to_text(const Edit& edit);
+/// Whether two edits of one object cannot be combined: two of a kind, or anything with its removal.
+bool contradict(const Edit& a, const Edit& b);
 /// Edits in their canonical order, whatever the given one; ArgumentError where two contradict each other.
 std::vector<Edit> parse_edits(const std::vector<std::string>& texts);
 

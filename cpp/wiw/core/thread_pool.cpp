@@ -1,6 +1,8 @@
 // SPDX-License-Identifier: Apache-2.0
 #include "wiw/core/thread_pool.hpp"
 
+#include <unistd.h>
+
 #include <algorithm>
 #include <atomic>
 #include <cstdlib>
@@ -52,7 +54,7 @@ struct ThreadPool::Job {
   }
 };
 
-ThreadPool::ThreadPool(int threads) {
+ThreadPool::ThreadPool(int threads) : owner_(getpid()) {
   if (threads < 1) throw ArgumentError("ThreadPool: expected at least 1 thread, got " + std::to_string(threads));
   workers_.reserve(static_cast<std::size_t>(threads) - 1);
   try {
@@ -89,7 +91,8 @@ void ThreadPool::work() {
 }
 
 void ThreadPool::parallel_for(std::size_t count, const std::function<void(std::size_t)>& body) {
-  if (workers_.empty() || count < 2 || inside_job) {
+  // A forked child has no workers, and its mutexes may be locked for ever.
+  if (workers_.empty() || count < 2 || inside_job || getpid() != owner_) {
     for (std::size_t i = 0; i < count; ++i) body(i);
     return;
   }
@@ -109,7 +112,8 @@ void ThreadPool::parallel_for(std::size_t count, const std::function<void(std::s
 }
 
 ThreadPool& ThreadPool::shared() {
-  static ThreadPool pool(shared_size());
+  // Never destroyed: a forked child that ends would wait for threads that it does not have.
+  static ThreadPool& pool = *new ThreadPool(shared_size());
   return pool;
 }
 

@@ -1,6 +1,8 @@
 // SPDX-License-Identifier: Apache-2.0
 #pragma once
 
+#include <sys/types.h>
+
 #include <condition_variable>
 #include <cstddef>
 #include <functional>
@@ -23,7 +25,8 @@ class ThreadPool {
   [[nodiscard]] int size() const { return static_cast<int>(workers_.size()) + 1; }
 
   /// Calls body(i) for every i in [0, count), in any order, and returns when all are done. The first exception is
-  /// rethrown here after the others have finished. A call from inside a body runs inline.
+  /// rethrown here after the others have finished. A call from inside a body runs inline, and so does one in a forked
+  /// child, where only the thread that forked exists.
   void parallel_for(std::size_t count, const std::function<void(std::size_t)>& body);
 
   /// The pool all rooms share; its size is the machine's cores, or WIW_NUM_THREADS.
@@ -40,6 +43,7 @@ class ThreadPool {
   Job* job_ = nullptr;
   std::size_t generation_ = 0;
   bool stop_ = false;
+  const pid_t owner_;  // process that the workers run in
   std::vector<std::thread> workers_;
 };
 

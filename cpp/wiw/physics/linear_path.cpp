@@ -27,6 +27,7 @@ Pose between(const Pose& from, const Pose& to, double share) {
 }
 
 constexpr double kMostSegments = 1e6;
+constexpr double kMostSteps = 1e6;  // of time, from one waypoint to the next
 
 int segments(const Pose& from, const Pose& to, const LinearPathOptions& options) {
   if (!(options.step > 0) || !(options.angle_step > 0) || !(options.tolerance >= 0)) {
@@ -40,6 +41,28 @@ int segments(const Pose& from, const Pose& to, const LinearPathOptions& options)
   if (count > kMostSegments)
     throw ArgumentError("expected a path of at most a million waypoints; make its steps longer");
   return std::max(1, static_cast<int>(count));
+}
+
+/// Time steps to each waypoint but the first, by the joints' velocity limits at a share `speed` of them.
+std::vector<int> count_steps(const World& world, int articulation, const LinearPath& path, double speed) {
+  const Articulation& robot = *world.articulation(articulation);
+  const double reach = speed * world.options().time_step;
+  std::vector<int> steps;
+  for (std::size_t i = 1; i < path.joints.size(); ++i) {
+    const Eigen::VectorXd way = path.joints[i] - path.joints[i - 1];
+    double longest = 1;
+    for (const int joint : path.moved) {
+      const double count = std::abs(way[joint]) / (reach * robot.limits().velocity[joint]);
+      if (count > kMostSteps) {
+        throw ArgumentError("expected a path of at most a million time steps from one waypoint to the next; joint '" +
+                            robot.movable_joints()[static_cast<std::size_t>(joint)] +
+                            "' would take more; raise its velocity limit or the speed");
+      }
+      longest = std::max(longest, count);
+    }
+    steps.push_back(static_cast<int>(std::ceil(longest)));
+  }
+  return steps;
 }
 
 }  // namespace
@@ -96,14 +119,11 @@ bool follow(World& world, int articulation, const LinearPath& path, double speed
   if (!(tolerance > 0)) throw ArgumentError("expected a positive tolerance, got " + std::to_string(tolerance));
   if (path.joints.empty()) return false;
   for (const Eigen::VectorXd& each : path.joints) world.articulation(articulation)->check_positions(each, "path");
-  const Eigen::VectorXd& limit = world.articulation(articulation)->limits().velocity;
-  const double reach = speed * world.options().time_step;
+  const std::vector<int> counts = count_steps(world, articulation, path, speed);
   Eigen::VectorXd target = world.joint_targets(articulation);
   for (std::size_t i = 1; i < path.joints.size(); ++i) {
     const Eigen::VectorXd way = path.joints[i] - path.joints[i - 1];
-    double longest = 1;
-    for (const int joint : path.moved) longest = std::max(longest, std::abs(way[joint]) / (reach * limit[joint]));
-    const int steps = static_cast<int>(std::ceil(longest));
+    const int steps = counts[i - 1];
     for (int step = 1; step <= steps; ++step) {
       for (const int joint : path.moved) target[joint] = path.joints[i - 1][joint] + way[joint] * step / steps;
       world.set_joint_targets(articulation, target);

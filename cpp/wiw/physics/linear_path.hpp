@@ -38,7 +38,8 @@ LinearPath plan_linear(World& world, int articulation, int link, const Pose& T_w
                        const Touchable& allowed = {}, const LinearPathOptions& options = {});
 
 /// Drives the moved joints along the path at `speed` times their velocity limits (in (0, 1]), then waits until they
-/// stand within `tolerance` of the end, at most `settle` steps. Returns whether they do.
+/// stand within `tolerance` of the end, at most `settle` steps. Returns whether they do. Throws ArgumentError and
+/// moves nothing where a joint would take more than a million steps from one waypoint to the next.
 bool follow(World& world, int articulation, const LinearPath& path, double speed = 0.5, double tolerance = 1e-3,
             int settle = 240);
 

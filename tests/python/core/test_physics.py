@@ -433,6 +433,17 @@ def test_a_path_of_another_arm_is_not_followed() -> None:
         world.follow(path, other)
 
 
+def test_a_path_that_would_take_for_ever_is_refused() -> None:
+    text = tree(("R", "A", "prismatic"))
+    for velocity in ("1e-12", "1e-320"):
+        world = World(gravity=[0, 0, 0])
+        world.add_articulation(Articulation.from_text(text.replace('velocity="1"', f'velocity="{velocity}"')))
+        path = world.plan_linear(place(z=0.3), "A")
+        with pytest.raises(ArgumentError, match=r"a million time steps .* joint 'j0' would take more"):
+            world.follow(path)
+        assert world.snapshot().steps == 0 and world.joint_positions() == 0
+
+
 def test_a_joint_that_mimics_another_is_nothing_to_solve_for() -> None:
     joint = 'name="panda_joint6" type="revolute">'
     text = URDF.read_text()

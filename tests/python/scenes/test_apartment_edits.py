@@ -152,7 +152,8 @@ def test_specs_have_one_spelling() -> None:
     )
     assert scenes.resolve(other) == [SPEC] == scenes.resolve(SPEC)
     assert scenes.is_generated(SPEC) and scenes.absolute(SPEC) == SPEC
-    assert scenes.resolve("apartments:val/3") == ["apartments:val/3"]
+    assert scenes.resolve("apartments:val/3") == ["apartments:val/3"] == scenes.resolve("apartments:val/003")
+    assert scenes.resolve("apartments:val/03?remove:vase_1") == ["apartments:val/3?remove:vase_1"]
     for spec, message in (
         ("apartments:val?remove:vase_1", "single apartment"),
         ("apartments:val:2?remove:vase_1", "single apartment"),
@@ -187,6 +188,17 @@ def test_possible_edits_are_canonical_and_can_be_done() -> None:
     for spec in ("apartments:val", "apartments:val:3", "house.glb"):
         with pytest.raises(ArgumentError, match="single apartment"):
             scenes.possible_edits(spec)
+
+
+def test_possible_edits_can_be_added_to_those_applied() -> None:
+    for scene, applied, absent, offered in (
+        ("apartments:train/11", ["swap:candles_2,photo_1"], "remove:candles_2", "remove:candles_1"),
+        ("apartments:val/3", ["color:sofa_1=red", "state:toilet_1=open"], "remove:sofa_1", "color:toilet_1=red"),
+    ):
+        edits = scenes.possible_edits(f"{scene}?{'&'.join(applied)}")
+        assert absent not in edits and offered in edits
+        for edit in edits:
+            _core.scene.canonical_edits([*applied, edit])
 
 
 def test_edited_scenes_are_kept_under_names_of_their_own(

@@ -126,13 +126,15 @@ void Arm::make_links() {
 
 void Arm::make_collider(int group) {
   const LinkGroup& from = model_->groups[static_cast<std::size_t>(group)];
-  if (from.shape->empty()) return;
+  const bool touches = !from.shape->empty();
+  // Bullet solves the motor and the limits of a link together with its collider's contacts; without one, never.
+  if (group == 0 && !touches) return;
   auto collider = std::make_unique<btMultiBodyLinkCollider>(body_.get(), group - 1);
-  collider->setCollisionShape(from.shape->root());
+  collider->setCollisionShape(touches ? from.shape->root() : &no_shape_);
   collider->setFriction(kFriction);
   collider->setUserIndex2(group);
   collider->setActivationState(DISABLE_DEACTIVATION);
-  int kind = btBroadphaseProxy::DefaultFilter, meets = btBroadphaseProxy::AllFilter;
+  int kind = btBroadphaseProxy::DefaultFilter, meets = touches ? int{btBroadphaseProxy::AllFilter} : 0;
   if (group == 0) {
     body_->setBaseCollider(collider.get());
     collider->setCollisionFlags(collider->getCollisionFlags() | btCollisionObject::CF_STATIC_OBJECT);

@@ -1,6 +1,7 @@
 // SPDX-License-Identifier: Apache-2.0
 #pragma once
 
+#include <BulletCollision/CollisionShapes/btEmptyShape.h>
 #include <BulletDynamics/Featherstone/btMultiBody.h>
 #include <BulletDynamics/Featherstone/btMultiBodyConstraint.h>
 #include <BulletDynamics/Featherstone/btMultiBodyDynamicsWorld.h>
@@ -74,6 +75,7 @@ class Arm {
   btMultiBodyDynamicsWorld& world_;
   const double time_step_;
   std::unique_ptr<btMultiBody> body_;
+  btEmptyShape no_shape_;  // of links that touch nothing
   std::vector<std::unique_ptr<btMultiBodyLinkCollider>> colliders_;
   std::vector<std::unique_ptr<btMultiBodyConstraint>> limits_;
   std::vector<std::unique_ptr<btMultiBodyJointMotor>> motors_;  // by movable joint

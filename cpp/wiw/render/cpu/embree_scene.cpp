@@ -30,44 +30,38 @@ EmbreeScene::EmbreeScene(const scene::Scene& scene, const ShadingScene& shading,
     : scene_(scene), shading_(shading), device_(rtcNewDevice(device_options(isa).c_str())) {
   if (device_ == nullptr) throw BackendError("render: Embree does not start on this processor; use the GPU back end");
   // An unknown instruction set in the options is not an error for Embree, it silently takes another one.
-  if (rtcGetDeviceProperty(device_, native_packet(isa)) == 0 ||
-      rtcGetDeviceProperty(device_, RTC_DEVICE_PROPERTY_RAY_MASK_SUPPORTED) == 0) {
+  if (rtcGetDeviceProperty(device_.get(), native_packet(isa)) == 0 ||
+      rtcGetDeviceProperty(device_.get(), RTC_DEVICE_PROPERTY_RAY_MASK_SUPPORTED) == 0) {
     throw BackendError("render: this Embree lacks ray masks or " + isa_name(isa) +
                        " packets; set WIW_ISA to a lower one (scalar, avx2)");
   }
   for (const InstanceMesh& part : shading.parts()) cutouts_.push_back({shading.records(part), &shading.surface(part)});
   in_moved_.assign(shading.parts().size(), false);
   away_.assign(shading.parts().size(), false);
-  fixed_ = rtcNewScene(device_);
-  moved_ = rtcNewScene(device_);
-  rtcSetSceneFlags(moved_, RTC_SCENE_FLAG_DYNAMIC);
-  rtcSetSceneBuildQuality(moved_, RTC_BUILD_QUALITY_LOW);  // a tree for each geometry
+  fixed_.reset(rtcNewScene(device_.get()));
+  moved_.reset(rtcNewScene(device_.get()));
+  rtcSetSceneFlags(moved_.get(), RTC_SCENE_FLAG_DYNAMIC);
+  rtcSetSceneBuildQuality(moved_.get(), RTC_BUILD_QUALITY_LOW);  // a tree for each geometry
   for (std::size_t i = 0; i < shading.parts().size(); ++i) {
-    RTCGeometry geometry = make_geometry(i, scene.instances[shading.parts()[i].instance].T_world_instance);
-    rtcAttachGeometryByID(fixed_, geometry, static_cast<unsigned>(i));
-    rtcReleaseGeometry(geometry);
+    const auto geometry = make_geometry(i, scene.instances[shading.parts()[i].instance].T_world_instance);
+    rtcAttachGeometryByID(fixed_.get(), geometry.get(), static_cast<unsigned>(i));
   }
-  rtcCommitScene(fixed_);
+  rtcCommitScene(fixed_.get());
   check("building the scene");
 }
 
-EmbreeScene::~EmbreeScene() {
-  rtcReleaseScene(fixed_);
-  rtcReleaseScene(moved_);
-  rtcReleaseDevice(device_);
-}
-
 void EmbreeScene::check(const char* what) const {
-  const RTCError error = rtcGetDeviceError(device_);
+  const RTCError error = rtcGetDeviceError(device_.get());
   if (error == RTC_ERROR_OUT_OF_MEMORY) throw Error(std::string("render: out of memory while ") + what);
   if (error != RTC_ERROR_NONE) {
     throw Error(std::string("render: Embree error ") + std::to_string(error) + " while " + what);
   }
 }
 
-RTCGeometry EmbreeScene::make_geometry(std::size_t number, const Eigen::Affine3f& T_world_instance) {
+EmbreeOwner<RTCGeometry> EmbreeScene::make_geometry(std::size_t number, const Eigen::Affine3f& T_world_instance) {
   const scene::Mesh& mesh = scene_.meshes[shading_.parts()[number].mesh];
-  RTCGeometry geometry = rtcNewGeometry(device_, RTC_GEOMETRY_TYPE_TRIANGLE);
+  EmbreeOwner<RTCGeometry> owner(rtcNewGeometry(device_.get(), RTC_GEOMETRY_TYPE_TRIANGLE));
+  RTCGeometry geometry = owner.get();
   rtcSetNewGeometryBuffer(geometry, RTC_BUFFER_TYPE_VERTEX, 0, RTC_FORMAT_FLOAT3, sizeof(Eigen::Vector3f),
                           mesh.positions.size());
   set_triangles(geometry, number);
@@ -78,7 +72,7 @@ RTCGeometry EmbreeScene::make_geometry(std::size_t number, const Eigen::Affine3f
     rtcSetGeometryOccludedFilterFunction(geometry, pierce);
   }
   rtcCommitGeometry(geometry);
-  return geometry;
+  return owner;
 }
 
 void EmbreeScene::set_triangles(RTCGeometry geometry, std::size_t number) const {
@@ -127,11 +121,11 @@ void EmbreeScene::move(std::span<const MeshPlacement> parts) {
   }
   // Trees are built from the parts as the scene has them and fitted to every later pose, which is much faster than
   // building and leaves pictures a function of the poses alone.
-  if (any_new) rtcCommitScene(moved_);
+  if (any_new) rtcCommitScene(moved_.get());
   bool any_placed = false;
   for (const MeshPlacement& part : parts) {
     if (!in_moved_[part.number]) continue;
-    RTCGeometry geometry = rtcGetGeometry(moved_, static_cast<unsigned>(part.number));
+    RTCGeometry geometry = rtcGetGeometry(moved_.get(), static_cast<unsigned>(part.number));
     write_vertices(geometry, part.number, *part.T_world_instance);
     rtcUpdateGeometryBuffer(geometry, RTC_BUFFER_TYPE_VERTEX, 0);
     show(part.number, is_home(part));
@@ -139,7 +133,7 @@ void EmbreeScene::move(std::span<const MeshPlacement> parts) {
     any_placed = true;
   }
   if (!any_placed) return;
-  rtcCommitScene(moved_);
+  rtcCommitScene(moved_.get());
   check("moving instances");
 }
 
@@ -153,8 +147,8 @@ bool EmbreeScene::is_home(const MeshPlacement& part) const {
 void EmbreeScene::show(std::size_t number, bool from_fixed) {
   const auto id = static_cast<unsigned>(number);
   // Traversal reads a geometry's mask at every hit, so masking needs no rebuild of the fixed scene.
-  rtcSetGeometryMask(rtcGetGeometry(fixed_, id), from_fixed ? kVisible : 0);
-  rtcSetGeometryMask(rtcGetGeometry(moved_, id), from_fixed ? 0 : kVisible);
+  rtcSetGeometryMask(rtcGetGeometry(fixed_.get(), id), from_fixed ? kVisible : 0);
+  rtcSetGeometryMask(rtcGetGeometry(moved_.get(), id), from_fixed ? 0 : kVisible);
   if (away_[number] != from_fixed) return;
   away_[number] = !from_fixed;
   away_count_ += from_fixed ? -1 : 1;
@@ -162,16 +156,15 @@ void EmbreeScene::show(std::size_t number, bool from_fixed) {
 
 void EmbreeScene::adopt(std::size_t number) {
   const auto id = static_cast<unsigned>(number);
-  RTCGeometry geometry = make_geometry(number, scene_.instances[shading_.parts()[number].instance].T_world_instance);
-  rtcSetGeometryBuildQuality(geometry, RTC_BUILD_QUALITY_REFIT);
-  rtcCommitGeometry(geometry);
-  rtcAttachGeometryByID(moved_, geometry, id);
-  rtcReleaseGeometry(geometry);
+  const auto geometry = make_geometry(number, scene_.instances[shading_.parts()[number].instance].T_world_instance);
+  rtcSetGeometryBuildQuality(geometry.get(), RTC_BUILD_QUALITY_REFIT);
+  rtcCommitGeometry(geometry.get());
+  rtcAttachGeometryByID(moved_.get(), geometry.get(), id);
   in_moved_[number] = true;
 }
 
 std::string EmbreeScene::version() const {
-  const auto version = rtcGetDeviceProperty(device_, RTC_DEVICE_PROPERTY_VERSION);
+  const auto version = rtcGetDeviceProperty(device_.get(), RTC_DEVICE_PROPERTY_VERSION);
   return std::to_string(version / 10000) + "." + std::to_string(version / 100 % 100) + "." +
          std::to_string(version % 100);
 }

@@ -6,6 +6,7 @@
 #include <memory>
 #include <span>
 #include <string>
+#include <type_traits>
 #include <vector>
 
 #include "wiw/core/cpu.hpp"
@@ -13,13 +14,21 @@
 
 namespace wiw::render::cpu {
 
+struct EmbreeRelease {
+  void operator()(RTCDevice device) const { rtcReleaseDevice(device); }
+  void operator()(RTCScene scene) const { rtcReleaseScene(scene); }
+  void operator()(RTCGeometry geometry) const { rtcReleaseGeometry(geometry); }
+};
+/// Owns a device, scene or geometry of Embree.
+template <class Handle>
+using EmbreeOwner = std::unique_ptr<std::remove_pointer_t<Handle>, EmbreeRelease>;
+
 /// The parts' triangles in two Embree scenes: one built once from everything, and a small dynamic one with the parts
 /// that have been moved. Each part is masked out of one of them: out of the first while it is away from where the scene
 /// has it, so that one is never rebuilt. Geometry ids are part numbers in both.
 class EmbreeScene {
  public:
   EmbreeScene(const scene::Scene& scene, const ShadingScene& shading, Isa isa);
-  ~EmbreeScene();
   EmbreeScene(const EmbreeScene&) = delete;
   EmbreeScene& operator=(const EmbreeScene&) = delete;
 
@@ -29,9 +38,9 @@ class EmbreeScene {
   };
   void move(std::span<const MeshPlacement> parts);
 
-  [[nodiscard]] RTCScene fixed() const { return fixed_; }
+  [[nodiscard]] RTCScene fixed() const { return fixed_.get(); }
   /// Null while every part is where the scene has it.
-  [[nodiscard]] RTCScene moved() const { return away_count_ > 0 ? moved_ : nullptr; }
+  [[nodiscard]] RTCScene moved() const { return away_count_ > 0 ? moved_.get() : nullptr; }
   [[nodiscard]] std::string version() const;
 
  private:
@@ -44,7 +53,7 @@ class EmbreeScene {
   void adopt(std::size_t part);
   void show(std::size_t part, bool from_fixed);
   [[nodiscard]] bool is_home(const MeshPlacement& part) const;
-  RTCGeometry make_geometry(std::size_t part, const Eigen::Affine3f& T_world_instance);
+  EmbreeOwner<RTCGeometry> make_geometry(std::size_t part, const Eigen::Affine3f& T_world_instance);
   void set_triangles(RTCGeometry geometry, std::size_t part) const;
   void write_vertices(RTCGeometry geometry, std::size_t part, const Eigen::Affine3f& T_world_instance) const;
   void check(const char* what) const;
@@ -52,9 +61,9 @@ class EmbreeScene {
   const scene::Scene& scene_;
   const ShadingScene& shading_;
   std::vector<Cutout> cutouts_;  // by part
-  RTCDevice device_ = nullptr;
-  RTCScene fixed_ = nullptr;
-  RTCScene moved_ = nullptr;
+  EmbreeOwner<RTCDevice> device_;
+  EmbreeOwner<RTCScene> fixed_;
+  EmbreeOwner<RTCScene> moved_;
   std::vector<bool> in_moved_;  // by part
   std::vector<bool> away_;      // by part
   int away_count_ = 0;
