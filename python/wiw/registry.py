@@ -25,6 +25,7 @@ from pathlib import Path
 from typing import Any
 
 from wiw.errors import ConstructionError, Error, RegistryError, find_raising_line, is_stop_request
+from wiw.source_files import digest_imports
 from wiw.suggestions import did_you_mean
 
 
@@ -196,6 +197,10 @@ def _attribute(path: str) -> Any:
     return getattr(module, attribute)
 
 
+SOURCES = "__wiw_sources__"
+"""Attribute of a module from a file: the file's name, and a digest of it and the user's files that it imports."""
+
+
 def _import_file(path: Path) -> Any:
     """Return the module in a Python file; an edited file is imported again.
 
@@ -213,6 +218,7 @@ def _import_file(path: Path) -> Any:
         sys.path.insert(0, str(path.parent))
     loader = SourceFileLoader(name, str(path))
     module = importlib.util.module_from_spec(importlib.util.spec_from_loader(name, loader))  # type: ignore[arg-type]
+    module.__dict__[SOURCES] = f"{path.name} {digest_imports(path)}"
     sys.modules[name] = module
     try:  # from the source itself: bytecode on disk tells edits of the same length in the same second not apart
         exec(loader.source_to_code(path.read_bytes(), str(path)), module.__dict__)  # noqa: S102 - named by the user

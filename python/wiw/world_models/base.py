@@ -6,6 +6,7 @@ from __future__ import annotations
 import importlib.util
 import json
 import math
+import sys
 import time
 from abc import ABC, abstractmethod
 from collections.abc import Iterator, Mapping, Sequence
@@ -22,7 +23,7 @@ from numpy.typing import NDArray
 
 from wiw.action import TextTemplate
 from wiw.errors import ArgumentError, ContractError
-from wiw.registry import PLAN_SPACES
+from wiw.registry import PLAN_SPACES, SOURCES
 from wiw.types import PRIMITIVES, Conditioning, Control, ControlKind, View
 from wiw.world_models.pictures import check_pictures, sample
 
@@ -319,13 +320,14 @@ class WorldModel(ABC):
         """Return the digest that identifies cached rollouts; empty for a model without a `version`.
 
         It covers the class, its version, `identity()` and the content of `files()`; for a class in a file
-        (`path.py:Class`) also the file's path and modification time. Anything else that outputs depend on, such as a
-        network passed in memory, belongs in `describe()`.
+        (`path.py:Class`), the name and content of that file and of those next to it that it imports, wherever they
+        are. Anything else that outputs depend on, such as a network passed in memory, belongs in `describe()`.
         """
         if not self.version:
             return ""
         kind = type(self)
-        known = [kind.__module__, kind.__qualname__, self.version, self.identity()]
+        module = getattr(sys.modules.get(kind.__module__), SOURCES, kind.__module__)
+        known = [module, kind.__qualname__, self.version, self.identity()]
         digest = blake2b(json.dumps(known, sort_keys=True, default=str).encode(), digest_size=20)
         for file in self.files():
             status = file.stat()

@@ -33,6 +33,7 @@ FACES = {
     "json_text",
     "mapping_files",
     "registry",
+    "source_files",
     "suggestions",
     "networks",
     "process_limits",
