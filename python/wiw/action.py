@@ -40,6 +40,7 @@ __all__ = [
     "chunk",
     "frames_of_actions",
     "pad",
+    "parse_action",
     "relative_poses",
     "resample",
     "to_controls",
@@ -63,6 +64,11 @@ class GripperVocabulary:
 
     rotation: RotationCode = "euler"
     bounds: tuple[Sequence[float], Sequence[float]] | None = None
+
+    def __post_init__(self) -> None:
+        if self.bounds is not None:
+            low, high = (tuple(float(value) for value in each) for each in self.bounds)
+            object.__setattr__(self, "bounds", (low, high))
 
 
 @dataclass(frozen=True)
@@ -210,7 +216,7 @@ def to_controls(
             raise ArgumentError("to_controls: poses are absolute, one per frame; prepend the current pose instead")
         rotation = _rotation(vocabulary.rotation)
         return np.asarray(_core.encode_gripper(_poses(plan), rotation, vocabulary.bounds))
-    entries = {_action(key): value for key, value in vocabulary.items()}
+    entries = {parse_action(key): value for key, value in vocabulary.items()}
     scalar = all(np.ndim(value) == 0 for value in entries.values())
     whole = scalar and all(isinstance(value, int | np.integer) for value in entries.values())
     vectors = {key: np.atleast_1d(np.asarray(value, np.float64)).tolist() for key, value in entries.items()}
@@ -304,7 +310,12 @@ def frames_of_actions(count: int, frames: int, fit: Literal["pad", "resample", "
     return np.asarray(_core.frames_of_actions(count, frames, fit))
 
 
-def _action(key: int | str) -> Action:
+def parse_action(key: int | str) -> Action:
+    """Return the primitive of an id or name, such as "turn_left".
+
+    Raises:
+        ArgumentError: there is none.
+    """
     if isinstance(key, str):
         names = {action.name.lower(): action for action in Action}
         if key.lower() not in names:

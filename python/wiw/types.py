@@ -320,8 +320,8 @@ class Control:
     text: str = ""
     ids: NDArray[np.generic] | None = None
     """[K] or [K + 1] ids or vectors in the model's own vocabulary (primitive ids by default), with a leading null token
-    if it needs one; in space "pose7", float64 [K + 1, 7] gripper poses, beginning with that of frame 0; None unless the
-    model reads actions."""
+    if it needs one; in space "pose7", float64 [K + 1, 7] gripper poses, or [K + 1, D] in its vocabulary, beginning with
+    that of frame 0; None unless the model reads actions."""
     length: int = 0
     """Number of actions in the agent's plan; the rest is padding."""
     shared: int = 0

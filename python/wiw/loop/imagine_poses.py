@@ -101,8 +101,10 @@ def _make_control(accepts: Accepts, plan: Proposal, here: NDArray[np.float64], r
     poses = plan.actions
     if accepts.frames:
         poses = action.resample(poses, accepts.frames - 1, start=here)
-    text = plan.text or action.to_text(plan.actions) if tells else ""
+    text = plan.text or action.to_text(plan.actions, accepts.template) if tells else ""
     ids = np.concatenate([here[None], poses]) if accepts.control == "action" else None
+    if ids is not None and accepts.vocabulary is not None:
+        ids = action.to_controls(ids, accepts.vocabulary)
     unread = len(poses) - 1 if request.frames.ends and accepts.causal else 0
     return Control.of_poses(len(poses), text, ids, unread)
 

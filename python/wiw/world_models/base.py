@@ -21,10 +21,17 @@ from typing import Any, ClassVar
 import numpy as np
 from numpy.typing import NDArray
 
-from wiw.action import TextTemplate
+from wiw.action import (
+    GripperTextTemplate,
+    GripperVocabulary,
+    TextTemplate,
+    Vocabulary,
+    parse_action,
+    to_controls,
+)
 from wiw.errors import ArgumentError, ContractError
 from wiw.registry import PLAN_SPACES, SOURCES
-from wiw.types import PRIMITIVES, Conditioning, Control, ControlKind, View
+from wiw.types import GRIPPER_POSES, PRIMITIVES, Conditioning, Control, ControlKind, View
 from wiw.world_models.pictures import check_pictures, sample
 
 CONTROLS = ("image", "text", "trajectory", "viewpoint", "action")
@@ -47,9 +54,9 @@ class Accepts:
     needs: tuple[str, ...]
     causal: bool
     best_batch: int
-    vocabulary: dict[int, Any] | None
+    vocabulary: dict[int, Any] | GripperVocabulary | None
     null_first: bool
-    template: TextTemplate | None
+    template: TextTemplate | GripperTextTemplate | None
     cacheable: bool = False
     history: int = 0
     """Frames of `Conditioning.history`, including the observation; 0 if the model needs none."""
@@ -90,9 +97,9 @@ def accepts(
     needs: Sequence[str] = (),
     causal: bool = False,
     best_batch: int = 8,
-    vocabulary: dict[int, Any] | None = None,
+    vocabulary: Vocabulary | GripperVocabulary | None = None,
     null_first: bool = False,
-    template: TextTemplate | None = None,
+    template: TextTemplate | GripperTextTemplate | None = None,
     cacheable: bool = False,
     history: int | None = None,
     seeded: bool = True,
@@ -114,9 +121,11 @@ def accepts(
             `oracle` only.
         causal: frame k depends only on controls 1..k, so shared prefixes are imagined once.
         best_batch: number of rows per call at which the model is most efficient.
-        vocabulary: map from primitive id to the model's own id or vector, for control "action"; default: primitive ids.
+        vocabulary: for control "action": map from primitive (id or name, such as "turn_left") to the model's own id or
+            vector, or a `wiw.action.GripperVocabulary` for space "pose7"; default: primitive ids, or poses as they are.
         null_first: the model expects a null token for frame 0 before the actions.
-        template: wording of the prompt, for control "text"; see `wiw.action.TextTemplate`.
+        template: wording of the prompt, for control "text": a `wiw.action.TextTemplate`, or a `GripperTextTemplate` for
+            space "pose7". A plan of poses to which its policy gave a text keeps that text.
         cacheable: cache rollouts on disk by default, so that none is computed twice; needs a `version`. Set it for a
             slow model whose output is a function of its inputs: not for one that draws random numbers without the
             seeds, nor for a server that may change.
@@ -142,8 +151,7 @@ def accepts(
         raise ArgumentError(f"accepts: frames includes the observation: expected 0 (any) or at least 2, got {frames}")
     if best_batch < 1:
         raise ArgumentError(f"accepts: expected best_batch of at least 1, got {best_batch}")
-    if template is not None and not isinstance(template, TextTemplate):
-        raise ArgumentError(f"accepts: expected template wiw.action.TextTemplate, got {type(template).__name__}")
+    _check_template(template, space)
     history = _check_history(history, needs)
     size = (int(size[0]), int(size[1]))
     return Accepts(
@@ -155,7 +163,7 @@ def accepts(
         tuple(needs),
         causal,
         best_batch,
-        vocabulary,
+        _check_vocabulary(vocabulary, space),
         null_first,
         template,
         cacheable,
@@ -163,6 +171,32 @@ def accepts(
         seeded,
         _check_smallest(smallest, size, view),
     )
+
+
+def _check_template(template: Any, space: str) -> None:
+    kind = GripperTextTemplate if space == GRIPPER_POSES else TextTemplate
+    if template is not None and not isinstance(template, kind):
+        raise ArgumentError(f"accepts: expected template wiw.action.{kind.__name__}, got {type(template).__name__}")
+
+
+def _check_vocabulary(vocabulary: Any, space: str) -> dict[int, Any] | GripperVocabulary | None:
+    """Return the vocabulary, with ids for the names of primitives."""
+    if vocabulary is None:
+        return None
+    if space == GRIPPER_POSES:
+        if not isinstance(vocabulary, GripperVocabulary):
+            raise ArgumentError(
+                f"accepts: expected vocabulary wiw.action.GripperVocabulary, got {type(vocabulary).__name__}"
+            )
+        to_controls(np.zeros((1, 7)), vocabulary)
+        return vocabulary
+    if not isinstance(vocabulary, Mapping):
+        raise ArgumentError(
+            f"accepts: expected vocabulary as a map from primitives to the model's own, got {type(vocabulary).__name__}"
+        )
+    own = {int(parse_action(key)): value for key, value in vocabulary.items()}
+    to_controls(list(own), own)
+    return own
 
 
 def _check_smallest(smallest: Sequence[int] | None, size: tuple[int, int], view: View) -> tuple[int, int] | None:

@@ -14,7 +14,7 @@ import numpy as np
 import pytest
 
 import wiw
-from wiw.action import FORWARD, TURN_LEFT
+from wiw.action import FORWARD, TURN_LEFT, TextTemplate
 from wiw.errors import ArgumentError
 from wiw.loop import rollout_cache
 from wiw.loop.attempts import Attempted
@@ -92,6 +92,15 @@ def test_a_question_is_put_once_also_by_another_process_and_in_other_company(tmp
     assert rows == 1
     np.testing.assert_array_equal(more[0, 1:], fresh[1, 1:])
     np.testing.assert_array_equal(more[2, 1:], Counting().rollout(*question([TURN_LEFT, FORWARD], seeds=[9]))[0, 1:])
+
+
+def test_equal_templates_share_entries_and_others_do_not(tmp_path) -> None:
+    def count_rows(prompt: str) -> int:
+        model = Counting()
+        model.accepts = wiw.accepts("text", size=(H, W), template=TextTemplate(prompt), cacheable=True)
+        return imagine_rows(make(tmp_path, model), *question(FF))[1]
+
+    assert [count_rows("Go: {actions}"), count_rows("Go: {actions}"), count_rows("Walk: {actions}")] == [1, 0, 1]
 
 
 @pytest.mark.parametrize(

@@ -4,12 +4,12 @@
 from __future__ import annotations
 
 import json
-from dataclasses import fields
+from dataclasses import asdict, fields
 from typing import Any
 
 import numpy as np
 
-from wiw.action import Action, TextTemplate
+from wiw.action import Action, GripperTextTemplate, GripperVocabulary, TextTemplate
 from wiw.errors import ArgumentError, RemoteError
 from wiw.json_text import parse_json
 from wiw.world_models.base import Accepts, accepts
@@ -22,7 +22,7 @@ def declaration(declared: Accepts) -> str:
     """Return JSON of what a model accepts."""
     values = {field.name: getattr(declared, field.name) for field in fields(declared)}
     if declared.vocabulary is not None:
-        values["vocabulary"] = [[int(name), np.asarray(own).tolist()] for name, own in declared.vocabulary.items()]
+        values["vocabulary"] = _vocabulary(declared.vocabulary)
     if declared.template is not None:
         values["template"] = _template(declared.template)
     return json.dumps(values)
@@ -37,10 +37,9 @@ def parse_declaration(text: str) -> Accepts:
     try:
         values: dict[str, Any] = parse_json(text)
         if values["vocabulary"] is not None:
-            values["vocabulary"] = dict(values["vocabulary"])
+            values["vocabulary"] = _parse_vocabulary(values["vocabulary"])
         if values["template"] is not None:
-            phrases = {Action(name): phrase for name, phrase in values["template"].pop("phrases")}
-            values["template"] = TextTemplate(phrases=phrases, **values["template"])
+            values["template"] = _parse_template(values["template"])
         sizes = {name: tuple(values[name]) for name in ("size", "smallest") if values.get(name) is not None}
         return accepts(**{**values, **sizes})
     except (ValueError, LookupError, TypeError, AttributeError, ArithmeticError, ArgumentError) as error:
@@ -66,7 +65,19 @@ def parse_description(text: str) -> dict[str, Any]:
     return values
 
 
-def _template(template: TextTemplate) -> dict[str, Any]:
+def _vocabulary(vocabulary: dict[int, Any] | GripperVocabulary) -> Any:
+    if isinstance(vocabulary, GripperVocabulary):
+        return asdict(vocabulary)
+    return [[name, np.asarray(own).tolist()] for name, own in vocabulary.items()]
+
+
+def _parse_vocabulary(values: Any) -> dict[int, Any] | GripperVocabulary:
+    return GripperVocabulary(**values) if isinstance(values, dict) else dict(values)
+
+
+def _template(template: TextTemplate | GripperTextTemplate) -> dict[str, Any]:
+    if isinstance(template, GripperTextTemplate):
+        return {"prompt": template.prompt, "phrase": template.phrase, "separator": template.separator}
     phrases = [[int(name), phrase] for name, phrase in template.phrases.items()]
     return {
         "prompt": template.prompt,
@@ -74,3 +85,10 @@ def _template(template: TextTemplate) -> dict[str, Any]:
         "separator": template.separator,
         "merge_runs": template.merge_runs,
     }
+
+
+def _parse_template(values: dict[str, Any]) -> TextTemplate | GripperTextTemplate:
+    if "phrase" in values:
+        return GripperTextTemplate(**values)
+    phrases = {Action(name): phrase for name, phrase in values.pop("phrases")}
+    return TextTemplate(phrases=phrases, **values)
