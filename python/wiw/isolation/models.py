@@ -181,7 +181,8 @@ class IsolatedModel(Isolated, WorldModel):
 
     def _begin(self) -> str:
         """Make the model in a process that has none; return its declaration."""
-        return str(self._make(make_model, self._options, self._patience, seconds=self._patience))
+        seconds = self._patience if math.isfinite(self._patience) else seconds_left()
+        return str(self._make(make_model, self._options, seconds, seconds=seconds))
 
 
 class _Declared:

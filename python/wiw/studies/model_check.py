@@ -28,6 +28,7 @@ from wiw.studies.model_queries import Frames, ModelQueries, Row
 from wiw.types import GRIPPER_POSES, PRIMITIVES, Control, History
 from wiw.world_models.base import WorldModel
 from wiw.world_models.pictures import CLOSE, OTHER
+from wiw.world_models.remote.model import Remote
 
 WALKS = ((FORWARD, TURN_LEFT, FORWARD, FORWARD), (FORWARD, TURN_LEFT, TURN_RIGHT, TURN_RIGHT), (FORWARD,) * 4)
 """Plans without leading turns, which the loop makes itself. The first two share a beginning, for causal models."""
@@ -66,6 +67,12 @@ RUNS: Mapping[str, tuple[str, int]] = {
     GRIPPER_POSES: ("200 episodes of manipulation", 200 * 3 * 5),
 }
 """The paper's runs, in words, and roughly how many rows they request: episodes times decisions times plans."""
+UNSEEN: Mapping[str, str] = {
+    "training": "its networks are on the server",
+    "inputs": "it gets copies over the network",
+    "memory": "its answers come as copies over the network",
+}
+"""The checks that a served model would always pass, and why."""
 LONG_RUN = 24.0
 """Hours above which such a run is called slow."""
 
@@ -261,7 +268,9 @@ class _ModelExaminer:
         return "it gave no usable answer"
 
     def _find_skip_reason(self, name: str) -> str:
-        """Return why a check can be skipped; empty if it cannot."""
+        """Return why a check can or must be skipped; empty if it is to be done."""
+        if isinstance(self.model, Remote) and name in UNSEEN:
+            return f"{UNSEEN[name]}; run `wiw check-model` on the server's machine"
         if name in ("batch", "causal", "history") and self._done["random"].findings:
             return "every comparison would fail: its answers are random"
         declared = {

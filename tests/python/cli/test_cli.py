@@ -500,3 +500,14 @@ def test_a_model_that_calls_exit_ends_no_command(tmp_path, two_rooms, short, cap
     file.write_text("import sys\nsys.exit(0)\n")
     code, said = ends("Quits", "--seed", "1")
     assert code == 2 and "cannot be loaded: SystemExit: 0 (leaving.py, line 2)" in said
+
+
+def test_the_check_of_a_served_model_says_what_it_cannot_see(two_rooms, capsys):
+    from wiw.serving.background import serve_in_background
+
+    with serve_in_background("copy") as server:
+        assert main(["check-model", f"remote:{server.address}", "--scenes", two_rooms]) == 0
+    said = capsys.readouterr().out
+    unseen = [line.split()[1] for line in said.splitlines() if "check-model` on the server's machine" in line]
+    assert unseen == ["training", "inputs", "memory"]
+    assert all(f"skipped  {name}" in said for name in unseen)

@@ -36,6 +36,7 @@ from wiw.policies.base import Situation
 from wiw.runs.recipes import AgentRecipe, TaskRecipe
 from wiw.studies.evaluate import evaluate
 from wiw.types import Conditioning, Control, Decision, Goal, Key, Observation
+from wiw.world_models.base import answer_deadline
 
 BAD = f"{PYTHON_TESTS / 'bad_models.py'}:Bad"
 PEEPING = BAD.replace(":Bad", ":Peeping")
@@ -237,6 +238,25 @@ def test_what_hangs_when_it_starts_anew_or_says_what_it_is_fails_by_a_deadline(t
     made._patience = 0.5
     with pytest.raises(RolloutError, match=r"cannot be loaded: no answer within 0\.5 s"):
         Attempted(made, 20.0).rollout(observe(), CONTROLS, np.zeros(2, np.uint64))
+
+
+def test_a_model_made_without_a_deadline_starts_anew_within_that_of_the_call(tmp_path) -> None:
+    file, marker = tmp_path / "hanging.py", tmp_path / "marker"
+    file.write_text(
+        "import os, time, wiw\n"
+        "class Hanging(wiw.WorldModel):\n"
+        "    accepts = wiw.accepts(control='image', view='perspective', size=(64, 128), frames=3)\n"
+        "    def __init__(self):\n"
+        f"        if os.path.exists({str(marker)!r}):\n"
+        "            time.sleep(99)\n"
+        "    def rollout(self, observations, controls, seeds):\n"
+        f"        open({str(marker)!r}, 'w').close()\n"
+        "        os._exit(3)\n"
+    )
+    made = wiw.world_model(f"{file}:Hanging")
+    for said in ("exit", r"did not return within [12]"):
+        with pytest.raises((ConstructionError, EndedError, ExitError), match=said), answer_deadline(2.0):
+            made.rollout(observe(), CONTROLS, np.zeros(2, np.uint64))
 
 
 def test_construction_and_import_fail_by_kind(tmp_path) -> None:

@@ -65,7 +65,6 @@ def train_pocket(
         cache: Folder for prepared training data, which can be deleted at any time. Default: $WIW_CACHE/looks.
     """
     from wiw.runs.part_options import parse_options
-    from wiw.training.pocket import held_out
     from wiw.training.pocket.recipe import PocketRecipe
     from wiw.training.post_training.recipe import load_recipe
     from wiw.world_models.devices import require
@@ -74,6 +73,8 @@ def train_pocket(
     check_counts(epochs=epochs)
     check_seed(seed)
     require(Pocket.requires)
+    from wiw.training.pocket import held_out
+
     with write_weights("pocket", out):
         numbers = drop_none({"epochs": epochs, "seed": seed})
         options = {**numbers, **parse_options(option, PocketRecipe, "--option")}
