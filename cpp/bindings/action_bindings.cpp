@@ -1,6 +1,7 @@
 // SPDX-License-Identifier: Apache-2.0
 #include <pybind11/eigen.h>
 #include <pybind11/native_enum.h>
+#include <pybind11/operators.h>
 #include <pybind11/pybind11.h>
 #include <pybind11/stl.h>
 
@@ -138,7 +139,22 @@ void bind_text(py::module_& module) {
       .def_readonly("prompt", &TextTemplate::prompt)
       .def_property_readonly("phrases", &phrases_of)
       .def_readonly("separator", &TextTemplate::separator)
-      .def_readonly("merge_runs", &TextTemplate::merge_runs);
+      .def_readonly("merge_runs", &TextTemplate::merge_runs)
+      .def(py::self == py::self)
+      .def("__hash__", [](const TextTemplate& words) { return py::hash(py::str(words.prompt)); })
+      .def("__repr__",
+           [](const TextTemplate& words) {
+             return py::str("TextTemplate(prompt={!r}, phrases={!r}, separator={!r}, merge_runs={!r})")
+                 .format(words.prompt, phrases_of(words), words.separator, words.merge_runs);
+           })
+      .def(py::pickle(
+          [](const TextTemplate& words) {
+            return py::make_tuple(words.prompt, words.phrases, words.separator, words.merge_runs);
+          },
+          [](const py::tuple& state) {
+            return TextTemplate{state[0].cast<std::string>(), state[1].cast<decltype(TextTemplate::phrases)>(),
+                                state[2].cast<std::string>(), state[3].cast<bool>()};
+          }));
   py::class_<GripperTextTemplate>(
       module, "GripperTextTemplate",
       "Words for a plan of 7-DoF poses. `prompt` holds {actions}; `phrase` may hold {x} {y} {z} "
@@ -154,7 +170,20 @@ void bind_text(py::module_& module) {
            py::arg("prompt") = py::none(), py::arg("phrase") = py::none(), py::arg("separator") = py::none())
       .def_readonly("prompt", &GripperTextTemplate::prompt)
       .def_readonly("phrase", &GripperTextTemplate::phrase)
-      .def_readonly("separator", &GripperTextTemplate::separator);
+      .def_readonly("separator", &GripperTextTemplate::separator)
+      .def(py::self == py::self)
+      .def("__hash__", [](const GripperTextTemplate& words) { return py::hash(py::str(words.prompt)); })
+      .def("__repr__",
+           [](const GripperTextTemplate& words) {
+             return py::str("GripperTextTemplate(prompt={!r}, phrase={!r}, separator={!r})")
+                 .format(words.prompt, words.phrase, words.separator);
+           })
+      .def(py::pickle(
+          [](const GripperTextTemplate& words) { return py::make_tuple(words.prompt, words.phrase, words.separator); },
+          [](const py::tuple& state) {
+            return GripperTextTemplate{state[0].cast<std::string>(), state[1].cast<std::string>(),
+                                       state[2].cast<std::string>()};
+          }));
   module.def(
       "to_text",
       [](const py::array& actions, const TextTemplate& words, const ActionSpace& space) {

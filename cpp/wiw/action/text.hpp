@@ -21,6 +21,8 @@ struct TextTemplate {
   std::string separator = ", then ";
   /// One phrase for a run of equal primitives ("move forward 0.6 m") instead of one for each.
   bool merge_runs = false;
+
+  bool operator==(const TextTemplate&) const = default;
 };
 
 /// How a plan of end-effector poses is put into words; the phrase may use {x} {y} {z} (metres), {roll} {pitch} {yaw}
@@ -29,6 +31,8 @@ struct GripperTextTemplate {
   std::string prompt = "A robot arm works at a table. Step by step, its gripper does this: {actions}.";
   std::string phrase = "moves to ({x}, {y}, {z}) m, turned by ({roll}, {pitch}, {yaw}) degrees, {gripper}";
   std::string separator = ", then ";
+
+  bool operator==(const GripperTextTemplate&) const = default;
 };
 
 std::string to_text(std::span<const Action> actions, const TextTemplate& words, const ActionSpace& space);

@@ -16,8 +16,18 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from wiw.analysis.intervals import p_value_of_sums, sum_by_cluster
 from wiw.analysis.rank_correlation import Correlation, correlate
-from wiw.analysis.statistics import Difference, Estimate, adjust_p_values, compare, estimate_difference, estimate_mean
+from wiw.analysis.statistics import (
+    LEVEL,
+    Difference,
+    Estimate,
+    adjust_p_values,
+    compare,
+    estimate_difference,
+    estimate_mean,
+    holm,
+)
 from wiw.analysis.summary import split_outcomes
 from wiw.experiments.errors.kinds import ERRORS
 from wiw.metrics.metric import ANSWER_SCORE, MEAN_TRAJECTORY, SUCCESS, Metric
@@ -77,6 +87,13 @@ class CostGap:
     measure: str
     loss: Estimate
     regret: Estimate | None
+    p_adjusted: float
+    """P of no difference in the loss, Holm-adjusted for all pairs of families at this measure."""
+
+    @property
+    def is_shown(self) -> bool:
+        """Whether one family is shown to cost more than the other."""
+        return self.p_adjusted <= LEVEL and self.loss.excludes_zero
 
 
 @dataclass(frozen=True)
@@ -296,12 +313,27 @@ class _Pooled:
         As a share of the most that could be lost or won it is a difference of rates, whose interval is honest where few
         episodes differ.
         """
-        most = float(np.abs(weights).sum())
         if not self._scenes:
             return None
-        shares = weights @ self._lost / most
+        most, shares = self._share(weights)
         found = estimate_difference(shares, np.zeros_like(shares), self._scenes, self._metric, seed=self._seed)
         return replace(found, value=most * found.value, low=most * found.low, high=most * found.high, bootstrap=None)
+
+    def test_loss(self, weights: NDArray[np.float64]) -> float:
+        """Return the p of no loss, for the weighted sum of what the arms lose: 1 - the confidence at which its interval
+        ends at 0. In a single scene, of its episodes; 1 for a single episode.
+        """
+        _, shares = self._share(weights)
+        if len(shares) == 1:
+            return 1.0
+        clusters = np.asarray(self._scenes) if len(set(self._scenes)) > 1 else np.arange(len(shares))
+        sums, counts = sum_by_cluster(shares, clusters)
+        return float(p_value_of_sums(sums, np.square(shares).sum(), counts, "difference"))
+
+    def _share(self, weights: NDArray[np.float64]) -> tuple[float, NDArray[np.float64]]:
+        """Return the most that could be lost, and what each episode lost, as a share of it."""
+        most = float(np.abs(weights).sum())
+        return most, weights @ self._lost / most
 
     def estimate_regret(self, weights: NDArray[np.float64]) -> Estimate | None:
         """Return the weighted sum of what the arms gain in regret, over episodes in which it was measured in all."""
@@ -333,9 +365,18 @@ def _list_costs(lines: Sequence[ErrorLine], pooled: _Pooled) -> tuple[tuple[Cost
             loss = pooled.estimate_loss(own)
             if loss is not None:
                 costs.append(Cost(family, measure, loss, pooled.estimate_regret(own), int((own != 0).sum())))
-        for base, family in combinations(known, 2) if measure != METRES else ():
-            apart = known[family] - known[base]
-            loss = pooled.estimate_loss(apart)
-            if loss is not None:
-                gaps.append(CostGap(family, base, measure, loss, pooled.estimate_regret(apart)))
+        if measure != METRES:
+            gaps += _list_gaps(known, measure, pooled)
     return tuple(costs), tuple(gaps)
+
+
+def _list_gaps(weights: Mapping[str, NDArray[np.float64]], measure: str, pooled: _Pooled) -> list[CostGap]:
+    """Return how much more each family costs than each before it, by one measure."""
+    found = []
+    for base, family in combinations(weights, 2):
+        apart = weights[family] - weights[base]
+        loss = pooled.estimate_loss(apart)
+        if loss is not None:
+            found.append(CostGap(family, base, measure, loss, pooled.estimate_regret(apart), pooled.test_loss(apart)))
+    adjusted = holm([each.p_adjusted for each in found])
+    return [replace(each, p_adjusted=float(p)) for each, p in zip(found, adjusted, strict=True)]

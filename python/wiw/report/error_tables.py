@@ -27,7 +27,7 @@ ABOUT: Mapping[str, str] = {
     "metres": "Distance of the imagined camera, or gripper, from its true place.",
 }
 COST_TITLES = ("points lost", "regret", "arms")
-GAP_TITLES = ("points", "regret")
+GAP_TITLES = ("points", "p", "regret")
 
 
 def list_titles(table: ErrorTable) -> list[str]:
@@ -58,7 +58,7 @@ def list_gaps(table: ErrorTable) -> list[tuple[str, list[str]]]:
     return [
         (
             f"{each.family} - {each.base}, per {_name_step(each.measure)}",
-            [show_estimate(each.loss, signed=True), _show(each.regret)],
+            [show_estimate(each.loss, signed=True), show_p(each.p_adjusted), _show(each.regret)],
         )
         for each in table.gaps
     ]
@@ -167,11 +167,11 @@ def _describe_cost(found: Cost, label: str) -> str:
 
 
 def _describe_gap(found: CostGap) -> str:
-    if not found.loss.excludes_zero:
+    if not found.is_shown:
         verdict = "undecided"
     else:
         verdict = f"{found.family if found.loss.value > 0 else found.base} costs more"
     return (
         f"At equal distance, {found.family} minus {found.base}: {show_estimate(found.loss, signed=True)} points per "
-        f"{_name_step(found.measure)}: {verdict}."
+        f"{_name_step(found.measure)} (p {show_p(found.p_adjusted)}, adjusted for all pairs): {verdict}."
     )

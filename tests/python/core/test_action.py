@@ -78,6 +78,26 @@ def test_step_sizes_are_configurable():
         action.ActionSpace(forward_m=0)
 
 
+@pytest.mark.parametrize(
+    ("words", "others"),
+    [
+        (
+            action.TextTemplate("[{actions}]", {FORWARD: "w"}, separator="é", merge_runs=True),
+            [action.TextTemplate(), action.TextTemplate("[{actions}]", {FORWARD: "w"}, separator="é")],
+        ),
+        (
+            action.GripperTextTemplate("[{actions}]", "{x}", "; "),
+            [action.GripperTextTemplate(), action.GripperTextTemplate("[{actions}]", "{y}", "; "), None],
+        ),
+    ],
+)
+def test_text_templates_are_values(words, others):
+    copy = pickle.loads(pickle.dumps(words))
+    assert copy == words and copy is not words and hash(copy) == hash(words) and repr(copy) == repr(words)
+    assert all(other != words and repr(other) != repr(words) for other in others)
+    assert "0x" not in repr(words) and "[{actions}]" in repr(words)
+
+
 def test_text_templates_can_be_replaced():
     words = action.TextTemplate("[{actions}]", {FORWARD: "w", TURN_LEFT: "a", TURN_RIGHT: "d"}, separator="")
     assert action.to_text([1, 1, 2, 3], words) == "[wwad]"

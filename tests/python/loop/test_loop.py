@@ -11,7 +11,7 @@ import pytest
 
 import wiw
 from wiw._core import core
-from wiw.action import FORWARD, TURN_LEFT, TURN_RIGHT, TextTemplate
+from wiw.action import FORWARD, TURN_LEFT, TURN_RIGHT, GripperTextTemplate, GripperVocabulary, TextTemplate
 from wiw.errors import ArgumentError, ContractError
 from wiw.experiments.fidelity import FidelityObserver
 from wiw.loop.attempts import TRIES, Attempted
@@ -316,8 +316,19 @@ def test_models_are_refused_that_ask_for_what_nobody_gives() -> None:
     wiw.Agent(Greedy(), model(needs=("depth",), frames=4), horizon=3)
     with pytest.raises(ArgumentError, match="size"):
         wiw.accepts(control="image", size=(480,))
-    with pytest.raises(ArgumentError, match="TextTemplate"):
-        wiw.accepts(control="text", template="prompt.txt")
+    for declared, said in [
+        ({"control": "text", "template": "prompt.txt"}, "TextTemplate"),
+        ({"control": "text", "template": GripperTextTemplate()}, "TextTemplate"),
+        ({"control": "text", "space": "pose7", "template": TextTemplate()}, "GripperTextTemplate"),
+        ({"control": "action", "vocabulary": {"jump": 1}}, "unknown action 'jump'"),
+        ({"control": "action", "vocabulary": {7: 1}}, "unknown action 7"),
+        ({"control": "action", "vocabulary": {1: [1, 0], 2: [1]}}, "one width"),
+        ({"control": "action", "vocabulary": GripperVocabulary()}, "map from primitives"),
+        ({"control": "action", "space": "pose7", "vocabulary": {1: 1}}, "GripperVocabulary"),
+        ({"control": "action", "space": "pose7", "vocabulary": GripperVocabulary("roll")}, "roll"),  # type: ignore[arg-type]
+    ]:
+        with pytest.raises(ArgumentError, match=said):
+            wiw.accepts(**declared)
 
 
 def test_a_model_gets_its_own_words_and_numbers(task: ImageNav) -> None:
@@ -335,7 +346,17 @@ def test_a_model_gets_its_own_words_and_numbers(task: ImageNav) -> None:
             assert all(control.ids.tolist() == [0, *control.actions.tolist()] for control in controls)
             return super().rollout(observations, controls, seeds)
 
-    for model in (Talker(), Numbers()):
+    class Named(Stamp):
+        names = ("forward", "turn_left", "turn_right", "stop")
+        accepts = wiw.accepts(
+            control="action", size=SIZE, vocabulary={"null": 9, **{name: 1 + i for i, name in enumerate(names)}}
+        )
+
+        def rollout(self, observations, controls, seeds):
+            assert all(control.ids.tolist() == [int(own) or 9 for own in control.actions] for control in controls)
+            return super().rollout(observations, controls, seeds)
+
+    for model in (Talker(), Numbers(), Named()):
         assert run(task, wiw.Agent(Greedy(), model), count=1).results[0].status == "done"
 
 

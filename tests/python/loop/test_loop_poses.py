@@ -12,7 +12,7 @@ import pytest
 
 import wiw
 from wiw._core import core
-from wiw.action import NULL, resample
+from wiw.action import NULL, GripperTextTemplate, GripperVocabulary, resample, to_controls, to_text
 from wiw.envs.base import Env, Guide, Segment
 from wiw.errors import ArgumentError, ContractError
 from wiw.experiments.ground_truth import TruePlans, TrueScores
@@ -204,6 +204,20 @@ def test_a_model_of_any_length_gets_the_plan_itself() -> None:
     imagine_plans(model, [plan_of(5), plan_of(3), plan_of(5, 0.7), plan_of(5, 0.2)])
     assert [[len(c.ids) for c in controls] for _, controls, _ in model._calls] == [[4], [6, 6], [6]]
     np.testing.assert_array_equal(model._calls[1][1][0].ids[1:], plan_of(5))
+
+
+def test_a_model_gets_poses_in_its_own_words_and_numbers() -> None:
+    plan = plan_of(3)
+    numbers = Spy(control="action", space="pose7", vocabulary=GripperVocabulary("matrix_6d"))
+    imagine_plans(numbers, [plan])
+    ids = numbers._calls[0][1][0].ids
+    assert ids.shape == (4, 10)
+    np.testing.assert_array_equal(ids[1:], to_controls(plan, GripperVocabulary("matrix_6d")))
+    words = Spy(control="text", space="pose7", template=GripperTextTemplate("Do: {actions}", "to {x}", "; "))
+    plans = [Proposal(plan), Proposal(plan_of(2), text="own words")]
+    imagine(words, [plans], [DotEnv(DotTask()).begin(DotTask().episodes(1)[0])])
+    texts = sorted(control.text for _, controls, _ in words._calls for control in controls)
+    assert texts == [to_text(plan, words.accepts.template), "own words"] and texts[0].startswith("Do: to ")
 
 
 @pytest.mark.parametrize("causal", [False, True])

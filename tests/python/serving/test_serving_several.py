@@ -8,6 +8,7 @@ import socket
 import threading
 import time
 from collections.abc import Iterator
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -70,6 +71,37 @@ def test_rows_are_spread_and_answered_as_by_one() -> None:
         assert client.fingerprint() == "counting 1"
     assert min(model.rows for model in models) >= 4, "each has had its share"
     assert sum(model.rows for model in models) == 50, "and no row is computed twice"
+
+
+FILE = """
+import wiw
+from helper_of_served import LEVEL
+
+class Mine(wiw.WorldModel):
+    accepts = wiw.accepts("trajectory", size=(8, 16))
+    version = "1"
+
+    def rollout(self, observations, controls, seeds):
+        return observations.image[:, None].repeat(len(controls[0].actions) + 1, 1) // LEVEL
+"""
+
+
+def test_copies_of_a_file_on_several_machines_are_one_model(tmp_path: Path) -> None:
+    names = {}
+    for machine, level in (("a", 2), ("b", 2), ("c", 3)):
+        folder = tmp_path / machine
+        folder.mkdir()
+        (folder / "served.py").write_text(FILE)
+        (folder / "helper_of_served.py").write_text(f"LEVEL = {level}\n")
+        names[machine] = f"{folder / 'served.py'}:Mine"
+    with contextlib.ExitStack() as stack:
+        models = {machine: wiw.world_model(name) for machine, name in names.items()}
+        for model in models.values():
+            stack.callback(model.close)
+        with serve(models["a"], models["b"]) as (client, _):
+            assert client.fingerprint() == models["a"].fingerprint() != ""
+        with pytest.raises(RemoteError, match="serves a different model"), serve(models["a"], models["c"]):
+            pass
 
 
 class Relay:

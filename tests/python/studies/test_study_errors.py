@@ -87,7 +87,28 @@ def test_costs_are_slopes_through_the_oracle(table) -> None:
     assert costs["control", METRES].loss.value == pytest.approx(12.5) and ("looks", METRES) not in costs
     (gap,) = [each for each in table.gaps if each.measure == "1 - SSIM"]
     assert (gap.family, gap.base) == ("control", "looks") and gap.loss.value == pytest.approx(12.5)
-    assert gap.loss.excludes_zero
+    assert gap.loss.excludes_zero and gap.is_shown and gap.p_adjusted < 0.05
+
+
+def test_pairs_of_families_are_adjusted_for_each_other() -> None:
+    arms = {**ARMS, "error-flicker@20": ("flicker", 20.0)}
+    rows = [*outcomes(), *({**row, "arm": "error-flicker@20"} for row in outcomes() if row["arm"] == "error-lag@2")]
+    looked = [*decisions(), *({**row, "arm": "error-flicker@20"} for row in decisions() if row["arm"] == "error-lag@2")]
+    found = summarise_errors("imagenav", "matcher", rows, looked, arms)
+    gaps = [each for each in found.gaps if each.measure == "1 - SSIM"]
+    alone = {(each.family, each.base): each for each in gaps}
+    assert len(gaps) == 3
+    pooled = alone["control", "looks"]
+    (single,) = [
+        each
+        for each in summarise_errors("imagenav", "matcher", outcomes(), decisions(), ARMS).gaps
+        if each.measure == "1 - SSIM"
+    ]
+    assert pooled.loss.value == single.loss.value and pooled.p_adjusted == pytest.approx(3 * single.p_adjusted)
+    for few in (1, 3):
+        cut = [{**row, "scene": "s0"} for row in rows if row["episode"] < few]
+        (one, *_) = summarise_errors("imagenav", "matcher", cut, looked, arms).gaps
+        assert 0.5 < one.p_adjusted <= 1 and not one.is_shown
 
 
 def test_the_words_say_what_the_numbers_do(table) -> None:

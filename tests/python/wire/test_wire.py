@@ -13,7 +13,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from hypothesis.extra import numpy as npst
 
-from wiw.action import TextTemplate
+from wiw.action import GripperTextTemplate, GripperVocabulary, TextTemplate
 from wiw.errors import RemoteError
 from wiw.types import Conditioning, Control, History
 from wiw.wire.arrays import DTYPES, pack_array, unpack_array
@@ -126,18 +126,24 @@ def test_equal_questions_have_equal_ids_and_others_do_not():
         accepts("action", vocabulary={1: [0.5, -1.0], 2: np.array([0.0, 1.0])}, null_first=True, best_batch=3),
         accepts("viewpoint", cacheable=True),
         accepts("text", size=(64, 128), template=TextTemplate("Go: {actions}", separator=" - ", merge_runs=True)),
+        accepts("action", vocabulary={"forward": 3, "turn_left": 1, "turn_right": 2}),
+        accepts("text", "perspective", space="pose7", template=GripperTextTemplate("Do {actions}", "go to {x}")),
+        accepts("action", "perspective", space="pose7", vocabulary=GripperVocabulary("quaternion_wxyz")),
+        accepts(
+            "action",
+            "perspective",
+            space="pose7",
+            vocabulary=GripperVocabulary(bounds=([-0.3, -0.5, 0.6], [0.7, 0.5, 1.6])),
+        ),
     ],
     ids=lambda model: model.control,
 )
 def test_declarations_come_out_as_they_went_in(model):
     found = parse_declaration(declaration(model))
-    vocabulary = model.vocabulary and {name: list(own) for name, own in model.vocabulary.items()}
-    same = {"template": None, "vocabulary": None}
-    assert dataclasses.replace(found, **same) == dataclasses.replace(model, **same)
-    assert found.vocabulary == vocabulary
-    if model.template is not None:
-        for name in ("prompt", "phrases", "separator", "merge_runs"):
-            assert getattr(found.template, name) == getattr(model.template, name)
+    if isinstance(model.vocabulary, dict):
+        own = {name: np.asarray(value).tolist() for name, value in model.vocabulary.items()}
+        model = dataclasses.replace(model, vocabulary=own)
+    assert found == model
 
 
 LONG, DEEP = "x" * 2**20, "[" * 100_000 + "]" * 100_000
