@@ -5,7 +5,8 @@ A scene file is named by the content of everything it was made from: the files r
 version. Beside it a small manifest remembers, for one source and its options, which files were read and which were
 looked for in vain, so that an edited file or a texture that has turned up since makes the scene be built again. Files
 appear under their names whole, so any number of processes may use the folder at once. When the folder outgrows its
-limit, the scenes that were not used for longest go first; processes that have them mapped keep them.
+limit, the scenes that were not used for longest go first; processes that have them mapped keep them. On a network file
+system, those of other machines would not, so scenes used in the last week stay there.
 """
 
 from __future__ import annotations
@@ -13,6 +14,7 @@ from __future__ import annotations
 import fcntl
 import json
 import logging
+import math
 import os
 import time
 import uuid
@@ -27,6 +29,7 @@ from typing import IO, Any
 
 from wiw import _core
 from wiw.errors import ArgumentError, FileError
+from wiw.file_systems import find_network
 
 _log = logging.getLogger("wiw.scenes")
 _CHUNK = 1 << 20
@@ -34,6 +37,8 @@ LIMIT_GB = 8.0
 """Most gigabytes that scenes may take; an apartment takes 15 MB. `$WIW_CACHE_GB` sets another limit."""
 DRAFT_LIFETIME = 24 * 3600
 """Seconds after which nobody can be writing a draft any more."""
+SHARED_LIFETIME = 7 * 24 * 3600
+"""Seconds after its last opening for which a scene on a network file system may be mapped by another machine."""
 
 
 @dataclass(frozen=True)
@@ -192,8 +197,9 @@ def _trim(newest: Path) -> None:
             status = path.stat()
             scenes.append((status.st_mtime_ns, status.st_size, path))
     excess = sum(size for _, size, _ in scenes) - limit()
-    for _, size, path in sorted(scenes):
-        if excess > 0 and path != newest:
+    latest = time.time() - SHARED_LIFETIME if excess > 0 and find_network(newest) else math.inf
+    for used, size, path in sorted(scenes):
+        if excess > 0 and path != newest and used < latest * 1e9:
             path.unlink(missing_ok=True)
             excess -= size
 

@@ -470,6 +470,25 @@ def test_drafts_of_killed_imports_are_removed(tmp_path: Path, own_cache: Path) -
     assert list(place.glob("*.tmp")) == [new]
 
 
+def test_on_a_network_file_system_scenes_of_the_last_week_are_kept(
+    own_cache: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(scenes.store, "find_network", lambda path: "nfs4")
+    monkeypatch.setenv("WIW_CACHE_GB", "1e-9")
+
+    def list_kept() -> set[Path]:
+        return set((own_cache / "scenes").glob("*.wiwscene"))
+
+    scenes.store.load_generated([1], flat)
+    old = list_kept()
+    scenes.store.load_generated([2], flat)
+    assert len(list_kept()) == 2 and old < list_kept()
+    for path in old:
+        os.utime(path, (time.time() - 8 * 24 * 3600,) * 2)
+    scenes.store.load_generated([3], flat)
+    assert len(list_kept()) == 2 and not old & list_kept()
+
+
 def test_a_scene_trimmed_by_another_process_at_once_is_used_all_the_same(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
