@@ -15,14 +15,14 @@ from wiw.judging.judge import HIGHEST_MARK, LOWEST_MARK, Judge, Judgement, Refer
 from wiw.judging.prompts.judge_prompt import JudgePrompt
 from wiw.vlm import Reply, Request, connect, user
 from wiw.vlm.cache import open_reply_cache
-from wiw.vlm.structured import find_json_object
+from wiw.vlm.structured import iterate_json_objects, strip_thoughts
 
 if TYPE_CHECKING:
     from pydantic import BaseModel
 
 TEMPERATURE, SEED, MAX_TOKENS = 0.2, 1234, 32
 """Sampling of OpenEQA's judge."""
-PARSER_VERSION = 1
+PARSER_VERSION = 2
 """Raised when a reply may be read as another mark than before."""
 LONGEST_ANSWER = 1000
 """Characters of an answer that the model is shown."""
@@ -191,7 +191,7 @@ def parse_mark(text: str, cut: bool = False) -> int:
     """
     if not text.strip():
         raise JudgeError("expected a mark from 1 to 5, got an empty reply", "empty")
-    value = _find_number(text.strip())
+    value = _find_number(strip_thoughts(text).strip())
     shown = text.strip()[:_REPORTED_CHARACTERS]
     if value is None:
         hint = "; it was cut off, so raise max_tokens if the model thinks aloud" if cut else ""
@@ -208,7 +208,7 @@ def _find_number(text: str) -> float | None:
     plain = _PLAIN_MARK.fullmatch(text)
     if plain is not None:
         return float(plain[1])
-    found, whole = find_json_object(text)
+    found, whole = [("", False), *iterate_json_objects(text)][-1]
     if not whole:
         return None
     try:

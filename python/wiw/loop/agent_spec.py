@@ -9,6 +9,7 @@ from typing import Any
 
 from wiw.errors import ArgumentError
 from wiw.loop.config import AgentConfig
+from wiw.loop.contract import check_declaration
 from wiw.loop.decision_pass import AgentParts, choose_frames
 from wiw.loop.imagination import Imaginer, NoModel
 from wiw.loop.imagine import NO_SEMANTICS
@@ -67,6 +68,7 @@ class AgentSpec:
                 f"Agent: policy {type(policy.unwrapped).__name__} only proposes; give a policy that scores as "
                 "`reviser=`"
             )
+        check_declaration(reviser)
         if reviser.space != space:
             raise ArgumentError(
                 f"Agent: {type(policy.unwrapped).__name__} plans in {plan_space(space).words}, but the reviser "
@@ -85,6 +87,7 @@ def _space_of(policy: Any) -> str:
 
 def _make_policy(policy: Any, space: str) -> Policy:
     made: Policy = POLICIES.make(policy, **space_option(POLICIES, policy, space))
+    check_declaration(made)
     if made.space != space:
         raise ArgumentError(
             f"Agent: expected plans in {plan_space(space).words}, but policy {type(made.unwrapped).__name__} makes "

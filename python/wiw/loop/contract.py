@@ -10,10 +10,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from wiw.errors import ArgumentError, ContractError
-from wiw.policies.base import Policy, Situation
+from wiw.policies.base import FrameSpec, Policy, Situation
 from wiw.types import Answer, ArmObservation, Goal, Proposal, TextAnswer
 from wiw.world_models.base import WorldModel
 from wiw.world_models.oracle import Oracle
+
+OBSERVED = ("depth", "wrist")
+"""What a policy can need of an observation besides images and odometry."""
 
 
 class PlanChecker(Protocol):
@@ -97,6 +100,22 @@ def _check_plans(name: str, space: PlanChecker, made: Any, lists: int, count: tu
             if not isinstance(plan, Proposal):
                 raise ContractError(f"{name}: expected wiw.types.Proposal, got {type(plan).__name__}")
             space.check_plan(name, plan.actions, horizon)
+
+
+def check_declaration(policy: Policy) -> None:
+    """Check what a policy declares of itself.
+
+    Raises:
+        ContractError: its `needs` are not a sequence of names that observations know, or `frames` is no `FrameSpec`.
+    """
+    name, needs = type(policy.unwrapped).__name__, policy.needs
+    if not isinstance(needs, Sequence) or isinstance(needs, str) or not set(needs) <= set(OBSERVED):
+        raise ContractError(
+            f"{name}.needs: expected any of {', '.join(map(repr, OBSERVED))} in a tuple, such as "
+            f"needs = ('depth',), got {needs!r}"
+        )
+    if not isinstance(policy.frames, FrameSpec):
+        raise ContractError(f"{name}.frames: expected wiw.policies.base.FrameSpec(view, size), got {policy.frames!r}")
 
 
 def check_scores(policy: Policy, scores: Any, proposals: Sequence[Sequence[Proposal]]) -> list[NDArray[np.float64]]:

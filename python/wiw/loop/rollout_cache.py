@@ -207,20 +207,28 @@ def cache_rollouts(model: WorldModel, cache: str | Path = "auto", budget_gb: flo
     """Return the model behind a cache: with "auto" if it is `cacheable`, never with "off", else in a folder.
 
     A model that is given the simulator is never cached: its answer depends on a whole scene, which no key can hold.
-    Nor is one without a `version`, for nobody could tell when its answers change: a warning names it.
+    Nor is one that cannot be identified (`WorldModel.fingerprint`), for nobody could tell when its answers change: a
+    warning names it.
     """
     accepts = model.accepts
     if cache == "off" or "simulator" in accepts.needs or (cache == "auto" and not accepts.cacheable):
         return model
     if not model.fingerprint():
-        _warn_unversioned(type(model.unwrapped).__name__)
+        _warn_unknown(type(model.unwrapped).__name__, bool(model.unwrapped.version))
         return model
     return Cached(model, RolloutCache(default_folder() if cache == "auto" else cache, budget_gb))
 
 
 @lru_cache(None)
-def _warn_unversioned(name: str) -> None:
+def _warn_unknown(name: str, has_version: bool) -> None:
     """Say once in a process that a model is not cached."""
+    if has_version:
+        _log.warning(
+            "rollouts of %s are not cached: it was made with an object that does not identify it. Override describe() "
+            "to name what its answers depend on; or leave the cache off",
+            name,
+        )
+        return
     _log.warning(
         "rollouts of %s are not cached: it declares no version. Give the class one, such as `version = '1'`, and "
         "change it whenever its answers change; or leave the cache off",

@@ -74,7 +74,7 @@ def find_departures(task: Task, agents: Mapping[str, Any], episodes: int | None 
     """
     if task.name not in EPISODES:
         return ()
-    recipes = [recipe for recipe in agents.values() if isinstance(recipe, AgentRecipe)]
+    recipes = [recipe.without_secrets() for recipe in agents.values() if isinstance(recipe, AgentRecipe)]
     paper = _load_protocol(task, recipes)
     count = task.default_episodes if episodes is None else episodes
     found = [*_compare_rules(task, paper), *_compare_episodes(task, count)]

@@ -137,8 +137,15 @@ def outcome_row(arm: str, result: EpisodeResult) -> OutcomeRow:
     """Return the row of an episode's end.
 
     Raises:
-        ContractError: the environment gives a metric that is no number, or details that are no mapping.
+        ContractError: the environment gives a metric that is no number, a success that is not from 0 to 1, or details
+            that are no mapping.
     """
+    success = result.metrics.get("success", 0.0)
+    if isinstance(success, int | float | np.number | np.bool_) and not 0 <= success <= 1:
+        raise ContractError(
+            f"arm {arm}, episode {result.episode}: cannot be recorded: success: expected 0 or 1, got {success}. "
+            "Correct what the environment returns"
+        )
     values = {"metrics": to_json(dict(result.metrics)), "details": to_json(dict(result.details))}
     _require_readable(arm, result.episode, "", values)
     return OutcomeRow(arm, result)

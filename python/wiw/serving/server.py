@@ -377,7 +377,8 @@ class Server:
 
 def _welcome(model: WorldModel, in_flight: int) -> Welcome:
     fingerprint = model.fingerprint()
-    unknown = "" if fingerprint else f"{type(model).__name__} declares no version"
+    lacks = "was made with an object that does not identify it" if model.unwrapped.version else "declares no version"
+    unknown = "" if fingerprint else f"{type(model.unwrapped).__name__} {lacks}"
     described = json.dumps({**model.describe(), **_sources(model, fingerprint)}, default=str)
     return Welcome(declaration(model.accepts), described, fingerprint, unknown, in_flight)
 

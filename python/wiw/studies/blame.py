@@ -17,6 +17,7 @@ from wiw.analysis.blame import FOLDER, Blame, list_failures, list_reruns, name_r
 from wiw.analysis.blame_schemes import Scheme, choose_scheme
 from wiw.errors import ArgumentError
 from wiw.experiments.counterparts import find_counterpart
+from wiw.registry import WORLD_MODELS
 from wiw.runs.execute import read_recipes, require_own_sources, require_scenes, run_pending
 from wiw.runs.platform import describe_platform
 from wiw.runs.recipes import AgentRecipe
@@ -174,11 +175,18 @@ def _make_recipes(base: RunStore, wanted: Mapping[str, set[int]]) -> tuple[Any, 
 
 
 def _with_ground_truth(recipe: AgentRecipe, stages: tuple[str, ...]) -> AgentRecipe:
-    """Return the agent with ground truth in some stages; a model that the oracle replaces is not built."""
+    """Return the agent with ground truth in some stages; a model that the oracle replaces is not built.
+
+    The oracle shows futures in the view and size that were chosen for the model.
+    """
     if (counterpart := find_counterpart(recipe.policy, stages)) is not None:
         own = recipe.with_policy(counterpart.policy)
         return own if recipe.reviser is None else replace(own, reviser=counterpart.policy)
-    own = replace(recipe.with_model("oracle"), placebo=None, error=None) if "imagination" in stages else recipe
+    own = recipe
+    if "imagination" in stages:
+        is_own = isinstance(recipe.model, str) and recipe.model in WORLD_MODELS.built_in
+        kept = {name: value for name, value in recipe.model_options.items() if is_own and name in ("view", "size")}
+        own = replace(recipe.with_model("oracle"), model_options=kept, placebo=None, error=None)
     return replace(own, ground_truth=stages)
 
 

@@ -24,6 +24,8 @@ _VOTE = re.compile(
     re.IGNORECASE,
 )
 """Matches a letter that stands by itself; "A chair" and "I'm sorry" begin with words."""
+LEAST_MASS = 0.01
+"""Probability of all letters together below which they are noise."""
 _VOTE_LENGTH = 64
 """Characters searched for a vote."""
 
@@ -50,7 +52,8 @@ def split_options(count: int, most: int) -> list[list[int]]:
 def read_logprobs(
     listed: Sequence[tuple[str, float]], labels: Sequence[str]
 ) -> tuple[NDArray[np.float64], NDArray[np.float64]] | None:
-    """Return the labels' probabilities, which sum to 1, and those that the model gave them; None if none is listed.
+    """Return the labels' probabilities, which sum to 1, and those that the model gave them; None if none is listed, or
+    all of them together have less than `LEAST_MASS`: the model is about to say something else.
 
     Variants of a label ("A", " A", "(A") are one. Of the former, a label that is not listed gets the most that it can
     have: as much as the least likely listed token, or the remaining probability; of the latter, nothing.
@@ -61,6 +64,8 @@ def read_logprobs(
         for label in labels
     ]
     if not any(found):
+        return None
+    if sum(math.exp(value) for values in found for value in values) < LEAST_MASS:
         return None
     left = 1.0 - float(sum(np.exp(value) for _, value in listed))
     least = min(*(value for _, value in listed), float(np.log(max(left, 1e-300))))

@@ -35,6 +35,8 @@ NOBODY_THERE = (
     ": no server answers there; start one (docs/vlm.md), give another with --vlm URL, or use --vlm mock for a dry run "
     "without a model"
 )
+BROKEN = ("abort", "error", "cancelled")
+"""Ends of a completion that the server broke off."""
 _PASSING = (408, 409, 425, 429)
 """Client errors that may pass; so may all of the server's, 500 and above."""
 
@@ -109,8 +111,8 @@ class OpenAIClient(Client):
 
     @property
     def manner(self) -> str:
-        """The images' format, and what constrains the answer."""
-        return f"{self.image_format} {self.dialect}"
+        """The images' format, what constrains the answer, and the server: others may have another model of its name."""
+        return f"{self.image_format} {self.dialect} {self.base_url}"
 
     def complete(self, calls: Sequence[Call]) -> list[Completion]:
         """All calls, at most `concurrency` at a time."""
@@ -239,7 +241,7 @@ class OpenAIClient(Client):
                 hint = REFUSED_LOGPROBS if kind == "refused" and "logprob" in said else ""
                 hint = NOBODY_THERE if said.startswith("APIConnectionError") else hint
                 raise VlmError(f"{self.base_url}: {said} ({times}){hint}", kind)
-            if wait([stopped], min(LONGEST_WAIT, retries.pause() if pause is None else pause)).done:
+            if wait([stopped], min(LONGEST_WAIT, max(pause or 0.0, retries.pause()))).done:
                 raise CancelledError
             retries.count += 1
 
@@ -375,9 +377,8 @@ def _completion(data: bytes) -> Completion:
         body = json.loads(data)
         choice = body["choices"][0]
         message, usage = choice["message"], body.get("usage") or {}
-        refusal, text = message.get("refusal"), message.get("content")
-        text = text if isinstance(text, str) else ""
-        finish = "refusal" if refusal else str(choice.get("finish_reason") or "stop")
+        refusal, text = message.get("refusal"), _join_text(message.get("content"))
+        finish = "refusal" if refusal else _read_finish(choice)
         return Completion(
             _clean(str(refusal) if refusal else text),
             finish,
@@ -386,8 +387,28 @@ def _completion(data: bytes) -> Completion:
             _tokens(usage.get("completion_tokens")),
         )
     except (ValueError, OverflowError, KeyError, IndexError, TypeError, AttributeError, RecursionError) as error:
-        begin = data[:80].decode("utf-8", "replace")
+        begin = data[:300].decode("utf-8", "replace")
         raise _NoCompletionError(f"expected a chat completion, got '{begin}' ({type(error).__name__})") from None
+
+
+def _join_text(content: Any) -> str:
+    """Return a message's text, which some servers give in parts."""
+    if isinstance(content, list):
+        return "".join(str(part.get("text") or "") for part in content if isinstance(part, dict))
+    return content if isinstance(content, str) else ""
+
+
+def _read_finish(choice: Mapping[str, Any]) -> str:
+    """Return why a completion ended.
+
+    Raises:
+        _NoCompletionError: it was broken off by the server, which is no answer of the model.
+    """
+    reason = choice.get("finish_reason")
+    reason = str((reason.get("type") if isinstance(reason, dict) else reason) or "stop")
+    if reason in BROKEN or choice.get("error"):
+        raise _NoCompletionError(f"the server broke the completion off: {choice.get('error') or reason}")
+    return reason
 
 
 def _tokens(count: Any) -> int:

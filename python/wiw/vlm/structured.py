@@ -40,17 +40,33 @@ def find_problem(completion: Completion) -> Problem | None:
 
 
 def parse_object(completion: Completion, schema: type[BaseModel]) -> tuple[Any, bool] | Problem:
-    """Return the object in a completion and whether its syntax was repaired, or why there is none."""
-    from pydantic import ValidationError
+    """Return the object in a completion and whether its syntax was repaired, or why there is none.
 
+    Of several objects, the last that fits the schema is the answer; what a model thinks aloud before it does not count.
+    """
     found = find_problem(completion)
     if found is not None:
         return found
-    text, whole = find_json_object(completion.text)
-    if not text:
+    found_objects = list(iterate_json_objects(strip_thoughts(completion.text)))
+    if not found_objects:
         refused = completion.text.strip().lower().replace("\u2019", "'").startswith(_REFUSALS)
         kind: Kind = "refusal" if refused else "malformed"
         return make_problem(kind, "no JSON object", completion)
+    problem: Problem | None = None
+    for text, whole in reversed(found_objects):  # what comes before the answer may be a draft, or an example
+        read = _read_object(text, whole, completion, schema)
+        if not isinstance(read, Problem):
+            return read
+        problem = problem or read
+        if not whole:  # a draft must not stand for an answer that was cut off
+            break
+    assert problem is not None
+    return problem
+
+
+def _read_object(text: str, whole: bool, completion: Completion, schema: type[BaseModel]) -> tuple[Any, bool] | Problem:
+    from pydantic import ValidationError
+
     if not whole:
         return make_problem("truncated", f"the JSON object does not end (finish: {completion.finish})", completion)
     try:
@@ -64,13 +80,22 @@ def parse_object(completion: Completion, schema: type[BaseModel]) -> tuple[Any, 
         return make_problem("malformed", str(error)[:200] or type(error).__name__, completion)
 
 
-def find_json_object(text: str) -> tuple[str, bool]:
-    """Return the first {...} in a text, and whether it is complete; braces in strings do not count. Empty if there
-    is none.
-    """
-    begin = text.find("{")
-    if begin < 0:
-        return "", False
+def strip_thoughts(text: str) -> str:
+    """Return what follows a model's thoughts, `<think>...</think>`; nothing where they do not end."""
+    return text.rpartition("</think>")[2].partition("<think>")[0]
+
+
+def iterate_json_objects(text: str) -> Iterator[tuple[str, bool]]:
+    """Yield each {...} in a text that is not part of another one, and whether it is complete."""
+    place = text.find("{")
+    while place >= 0:
+        found, whole = _read_braces(text, place)
+        yield found, whole
+        place = text.find("{", place + len(found))
+
+
+def _read_braces(text: str, begin: int) -> tuple[str, bool]:
+    """Return the {...} that begins at a place, and whether it is complete; braces in strings do not count."""
     depth, quoted, place = 0, "", begin
     while place < len(text):
         character = text[place]

@@ -4,6 +4,7 @@
 from __future__ import annotations
 
 import importlib.util
+import inspect
 import json
 import math
 import sys
@@ -286,6 +287,16 @@ class WorldModel(ABC):
         if "rollout" in cls.__dict__ and not isinstance(getattr(cls, "accepts", None), Accepts | property):
             raise ContractError(f"{cls.__name__}: set the class attribute `accepts = wiw.accepts(...)`")
 
+    def __new__(cls, *args: Any, **kwargs: Any) -> Any:
+        """Make an instance that knows what a user's class was constructed with."""
+        made = super().__new__(cls)
+        if not cls.__module__.startswith("wiw."):
+            made._constructed_with = _list_arguments(cls, args, kwargs)
+        return made
+
+    _constructed_with: tuple[dict[str, Any], tuple[str, ...]] = ({}, ())
+    """The constructor's arguments that are plain values, by name, and the names of others."""
+
     @abstractmethod
     def rollout(
         self, observations: Conditioning, controls: Sequence[Control], seeds: NDArray[np.uint64]
@@ -326,22 +337,23 @@ class WorldModel(ABC):
     def describe(self) -> dict[str, Any]:
         """Return a JSON-able identity for the run's manifest: the class and its options.
 
-        Default: public attributes that are plain values (numbers, text, paths, lists and mappings of them); networks
-        and arrays are left out. Override it to say what they were loaded from.
+        Default: arguments of the constructor and public attributes that are plain values (numbers, text, paths, lists
+        and mappings of them); networks and arrays are left out. Override it to say what they were loaded from.
         """
         public = {name: value for name, value in vars(self).items() if not name.startswith("_") and _is_plain(value)}
+        public = {**self._constructed_with[0], **public}
         options = {name: str(value) if isinstance(value, Path) else value for name, value in public.items()}
         return {"name": type(self).__name__, **options}
 
     def files(self) -> Sequence[Path]:
         """Return the files whose content the outputs depend on, such as weights.
 
-        Default: public attributes that name a file, except the `immaterial` ones. Override it for a folder, or if
-        `describe()` contains a digest.
+        Default: arguments of the constructor and public attributes that name a file, except the `immaterial` ones.
+        Override it for a folder, or if `describe()` contains a digest.
         """
         named = [
             Path(value).expanduser()
-            for name, value in sorted(vars(self).items())
+            for name, value in sorted({**self._constructed_with[0], **vars(self)}.items())
             if not name.startswith("_") and name not in self.immaterial and isinstance(value, str | Path) and value
         ]
         return [path for path in named if _is_file(path)]
@@ -351,22 +363,34 @@ class WorldModel(ABC):
         return {name: value for name, value in self.describe().items() if name not in self.immaterial}
 
     def fingerprint(self) -> str:
-        """Return the digest that identifies cached rollouts; empty for a model without a `version`.
+        """Return the digest that identifies cached rollouts; empty for a model that cannot be identified.
+
+        That is one without a `version`, or one made with an object that is no plain value, network of torch or array
+        and whose class does not override `describe()`.
 
         It covers the class, its version, `identity()` and the content of `files()`; for a class in a file
         (`path.py:Class`), the name and content of that file and of those next to it that it imports, wherever they
-        are. Anything else that outputs depend on, such as a network passed in memory, belongs in `describe()`.
+        are. Where a user's class does not override `describe()`, the parameters of torch networks in its attributes
+        count, too. Anything else that outputs depend on belongs in `describe()`.
         """
-        if not self.version:
-            return ""
         kind = type(self)
+        describes_itself = kind.describe is not WorldModel.describe
+        if not self.version or not (describes_itself or all(map(self._is_held, self._constructed_with[1]))):
+            return ""
         module = getattr(sys.modules.get(kind.__module__), SOURCES, kind.__module__)
         known = [module, kind.__qualname__, self.version, self.identity()]
         digest = blake2b(json.dumps(known, sort_keys=True, default=str).encode(), digest_size=20)
         for file in self.files():
             status = file.stat()
             digest.update(_file_digest(file.resolve(), status.st_size, status.st_mtime_ns))
+        if not describes_itself and not kind.__module__.startswith("wiw."):
+            for name, value in sorted(vars(self).items()):
+                digest.update(_digest_tensors(name, value))
         return digest.hexdigest()
+
+    def _is_held(self, argument: str) -> bool:
+        """Return whether an attribute of an argument's name, or one with an underscore, is a network or an array."""
+        return any(_is_tensors(vars(self).get(name)) for name in (argument, f"_{argument}"))
 
 
 _DEADLINE: ContextVar[float] = ContextVar("wiw_give_up", default=math.inf)
@@ -405,6 +429,48 @@ def _is_file(path: Path) -> bool:
         return path.is_file()
     except (OSError, ValueError):  # too long for a name, or with a null byte: an option that is no path
         return False
+
+
+def _list_arguments(
+    kind: type, args: Sequence[Any], kwargs: Mapping[str, Any]
+) -> tuple[dict[str, Any], tuple[str, ...]]:
+    """Return a constructor's arguments, defaults included: plain values by name, and the names of others."""
+    try:
+        bound = inspect.signature(kind.__init__).bind(None, *args, **kwargs)
+    except (TypeError, ValueError):  # the constructor refuses them itself
+        return {}, ()
+    bound.apply_defaults()
+    given: dict[str, Any] = {}
+    for name, value in list(bound.arguments.items())[1:]:
+        given |= value if bound.signature.parameters[name].kind is inspect.Parameter.VAR_KEYWORD else {name: value}
+    plain = {name: value for name, value in given.items() if _is_plain(value)}
+    return plain, tuple(name for name in given if name not in plain)
+
+
+def _is_tensors(value: Any) -> bool:
+    """Return whether a value is an array, or a tensor or network of torch."""
+    torch = sys.modules.get("torch")
+    return isinstance(value, np.ndarray) or (torch is not None and isinstance(value, torch.nn.Module | torch.Tensor))
+
+
+def _digest_tensors(name: str, value: Any) -> bytes:
+    """Return a digest of an array's, tensor's or network's numbers; nothing for anything else."""
+    if not _is_tensors(value):
+        return b""
+    digest = blake2b(name.encode(), digest_size=20)
+    tensors = {"": value} if not hasattr(value, "state_dict") else value.state_dict()
+    for part, numbers in tensors.items():
+        digest.update(part.encode())
+        if not _is_tensors(numbers):  # what a layer adds of its own
+            digest.update(repr(numbers).encode())
+            continue
+        digest.update(f"{numbers.dtype} {tuple(numbers.shape)}".encode())
+        if isinstance(numbers, np.ndarray):
+            digest.update(numbers.tobytes())
+        else:
+            flat = numbers.detach().cpu().contiguous().reshape(-1)
+            digest.update(flat.view(sys.modules["torch"].uint8).numpy().data)
+    return digest.digest()
 
 
 def _is_plain(value: Any) -> bool:

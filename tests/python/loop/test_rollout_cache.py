@@ -5,6 +5,7 @@ from __future__ import annotations
 
 import errno
 import logging
+import pickle
 import threading
 from dataclasses import replace
 from pathlib import Path
@@ -341,3 +342,44 @@ def test_the_same_run_twice_asks_nothing(tmp_path, two_rooms) -> None:
     uncached = wiw.evaluate(task, agent, 2, out=tmp_path / "c", cache="off", **quiet)
     assert [(r["episode"], r["decision"], r["scores"], r["executed"]) for r in uncached.decisions] == first
     assert (tmp_path / "logged.log").read_text().count("asked") > calls
+
+
+class Constructed(wiw.WorldModel):
+    """Keeps none of its arguments as they are."""
+
+    accepts = wiw.accepts(control="trajectory", size=(H, W), cacheable=True)
+    version = "1"
+
+    def __init__(self, weights=None, gain: float = 1.0, network=None, other=None, **more) -> None:
+        self._numbers = gain * np.ones(3)
+        self._network = network
+
+    rollout = Counting.rollout
+
+
+def test_arguments_of_the_constructor_count_though_no_attribute_holds_them(tmp_path) -> None:
+    file = tmp_path / "weights.pt"
+    file.write_bytes(b"one")
+    made = [Constructed(), Constructed(gain=0.1), Constructed(file), Constructed(shift=2)]
+    names = [model.fingerprint() for model in made]
+    assert len(set(names)) == 4 and "" not in names and Constructed(gain=1.0).fingerprint() == names[0]
+    file.write_bytes(b"two")
+    assert made[2].fingerprint() != names[2] and made[2].files() == [file]
+    assert made[1].describe()["gain"] == 0.1 and pickle.loads(pickle.dumps(made[1])).fingerprint() == names[1]
+    assert Constructed(other=object()).fingerprint() == "", "nobody can tell it from others"
+    own = type("Own", (Constructed,), {"describe": lambda self: {"name": "Own"}})
+    assert own(other=object()).fingerprint()
+
+
+def test_networks_given_in_memory_count_by_their_parameters(tmp_path, caplog) -> None:
+    torch = pytest.importorskip("torch")
+    one, two = (torch.nn.Linear(3, 2) for _ in range(2))
+    names = [Constructed(network=network).fingerprint() for network in (one, two, one)]
+    assert names[0] == names[2] != names[1] and "" not in names
+    with torch.no_grad():
+        one.weight += 1
+    assert Constructed(network=one).fingerprint() != names[0]
+    with caplog.at_level(logging.WARNING, "wiw.rollouts"):
+        unknown = Attempted(Constructed(other=one))  # it is no attribute
+        assert cache_rollouts(unknown, "auto") is unknown
+    assert "made with an object that does not identify it" in caplog.text

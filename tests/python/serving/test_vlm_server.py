@@ -263,10 +263,46 @@ def test_a_reply_that_is_cut_off_is_asked_for_again() -> None:
 
 
 def test_content_in_odd_shapes_is_no_answer() -> None:
-    for message in ({}, {"content": None}, {"content": ["x"]}, {"content": 3}):
+    for message in ({}, {"content": None}, {"content": ["x"]}, {"content": [{"type": "image"}]}, {"content": 3}):
         with speaking([json.dumps({"choices": [{"message": message}]}).encode()]) as url:
             (reply,) = connect(url, model="m").ask([Request((user("Say"),), tries=1)])
             assert reply.problem is not None and reply.problem.kind == "empty"
+
+
+def test_content_in_parts_is_joined() -> None:
+    parts = [{"type": "text", "text": "fi"}, {"type": "text", "text": "ne"}]
+    with speaking([json.dumps({"choices": [{"message": {"content": parts}}]}).encode()]) as url:
+        assert connect(url, model="m").ask([Request((user("Say"),), tries=1)])[0].text == "fine"
+
+
+@pytest.mark.parametrize("end", [{"finish_reason": "abort"}, {"finish_reason": {"type": "abort"}}, {"error": "OOM"}])
+def test_a_completion_that_the_server_broke_off_is_no_answer(end: Any, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("wiw.vlm.openai._Retries.pause", lambda self: 0.0)
+    broken = json.dumps({"choices": [{"message": {"content": "Hal"}, "finish_reason": "stop", **end}]}).encode()
+    with speaking([broken, GOOD]) as url:
+        assert connect(url, model="m", attempts=2).ask(REQUESTS[2:3])[0].text == "fine ?"
+    with speaking([broken, broken]) as url, pytest.raises(VlmError, match="broke the completion off") as error:
+        connect(url, model="m", attempts=2).ask(REQUESTS[2:3])
+    assert error.value.kind == "protocol"
+
+
+def test_a_wish_for_no_wait_at_all_does_not_use_up_the_tries_at_once() -> None:
+    faults = Misbehaviour({"429": 1.0}, retry_after=0.0)
+    with MisbehavingVlmServer(MockClient(), misbehaviour=faults) as server:
+        begin = time.monotonic()
+        with pytest.raises(VlmError):
+            connect(server.url, model="mock", attempts=3).ask(REQUESTS[2:3])
+        assert time.monotonic() - begin > 0.75 * (0.5 + 1.0)
+
+
+def test_two_servers_with_models_of_one_name_do_not_share_answers(tmp_path: Path) -> None:
+    said = []
+    for text in ("one", "two"):
+        with VlmServer(MockClient(lambda call, text=text: text)) as server:
+            client = connect(server.url, model="mock", cache=ReplyCache(tmp_path))
+            said += [client.ask([Request((user("Say"),))])[0].text for _ in range(2)]
+            assert client.spent["vlm_cached"] == 1
+    assert said == ["one", "one", "two", "two"]
 
 
 @pytest.mark.parametrize("wait", ["nan", "-1", "soon", "Mon, 01 Jan 99999 00:00:00 GMT"])

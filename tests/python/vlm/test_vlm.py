@@ -21,11 +21,11 @@ pydantic = pytest.importorskip("pydantic")
 pytest.importorskip("json_repair")
 
 from wiw.errors import ArgumentError, FileError, VlmError, WeightsError  # noqa: E402
-from wiw.vlm import Request, choices, connect, user  # noqa: E402
+from wiw.vlm import Request, choices, connect, structured, user  # noqa: E402
 from wiw.vlm.cache import ReplyCache, open_reply_cache  # noqa: E402
 from wiw.vlm.images import from_data_uri, to_data_uri  # noqa: E402
 from wiw.vlm.instances import generate_instance  # noqa: E402
-from wiw.vlm.messages import Completion  # noqa: E402
+from wiw.vlm.messages import Completion, Problem  # noqa: E402
 from wiw.vlm.mock import MockClient  # noqa: E402
 from wiw.vlm.prices import Prices  # noqa: E402
 
@@ -61,7 +61,7 @@ def slow_choice(listed: dict[str, float], labels: str) -> list[float]:
 def test_choices_equal_their_slow_twin(listed: dict[str, float]) -> None:
     found = choices.read_logprobs(list(listed.items()), "ABCD")
     named = [token for token in listed if token.strip(" (.)") in set("ABCD")]
-    if not named:
+    if sum(math.exp(listed[token]) for token in named) < choices.LEAST_MASS:
         assert found is None
         return
     assert found is not None
@@ -387,6 +387,38 @@ def test_a_local_model_answers_by_the_scores_of_the_first_token(tiny: Path) -> N
     assert reply.mass == pytest.approx(sum(slow), rel=1e-4)
     other = ask(client, "Which?", 255 - IMAGE, choices=("a", "b", "c"))
     assert not np.array_equal(reply.probabilities, other.probabilities), "the image is not looked at"
+
+
+@pytest.mark.parametrize(
+    "text",
+    [
+        '<think>Maybe {"reason": "draft", "actions": ["forward"]}? No, a wall.</think>ANSWER',
+        "<think>the goal {sofa} is left</think>\nANSWER",
+        "From {forward, turn_left, turn_right} I choose:\nANSWER",
+        'The form is {"reason": ..., "actions": [...]}. Here: ```json ANSWER```',
+        "I turn $22.5^{\\circ}$ left: ANSWER",
+        '{"reason": "draft", "actions": ["forward"]} is wrong, so: ANSWER',
+    ],
+)
+def test_the_last_object_that_fits_is_the_answer(text: str) -> None:
+    answer = '{"reason": "r", "actions": ["turn_left"]}'
+    found = structured.parse_object(Completion(text.replace("ANSWER", answer)), Plan)
+    assert not isinstance(found, Problem) and found[0].actions == ["turn_left"]
+
+
+def test_a_draft_does_not_stand_for_an_answer_that_was_cut_off() -> None:
+    draft = '{"reason": "draft", "actions": ["forward"]}'
+    for text, kind in (
+        (f'{draft} is wrong, so: {{"reason": "r", "act', "truncated"),
+        (f"<think>Maybe {draft}", "malformed"),
+    ):
+        found = structured.parse_object(Completion(text, "length"), Plan)
+        assert isinstance(found, Problem) and found.kind == kind
+
+
+def test_letters_with_next_to_no_probability_are_no_choice() -> None:
+    assert choices.read_logprobs([("<think>", math.log(0.9999)), ("A", math.log(8e-7))], "ABC") is None
+    assert choices.read_logprobs([("Well", math.log(0.9)), ("A", math.log(0.02))], "ABC") is not None
 
 
 def test_a_local_model_writes_text_and_objects(tiny: Path) -> None:
