@@ -134,6 +134,7 @@ def summarise_errors(
     arms: Mapping[str, tuple[str, float]],
     left_out: Sequence[str] = (),
     seed: int = 0,
+    others: Sequence[str] = (),
 ) -> ErrorTable:
     """Return what each error costs.
 
@@ -145,8 +146,9 @@ def summarise_errors(
         arms: kind and dose of each arm with an error.
         left_out: kinds of errors without arms here.
         seed: of the bootstrap.
+        others: arms with errors that were run but are not shown; p values are adjusted for them, too.
     """
-    names = [FLOOR, CEILING, *arms]
+    names = [FLOOR, CEILING, *arms, *others]
     done, _ = split_outcomes(names, [row for row in outcomes if row["arm"] in names])
     measured = _average_by_episode(decisions)
     _add_regret(done, measured)
@@ -158,7 +160,11 @@ def summarise_errors(
         for metric in (ANSWER_SCORE, SUCCESS)
         if all(metric.name in row["metrics"] for own in done.values() for row in own.values())
     )
-    lines = _adjust([_summarise_arm(arm, *arms[arm], done, measured, metric, seed) for arm in shown])
+    hidden = [compare(arm, CEILING, done, metric, seed) for arm in others if done[arm] and done[CEILING]]
+    lines = _adjust(
+        [_summarise_arm(arm, *arms[arm], done, measured, metric, seed) for arm in shown],
+        [each for each in hidden if each is not None],
+    )
     pooled = _Pooled(pooled_arms, sorted(scored), done, measured, metric, seed)
     costs, gaps = _list_costs([line for line in lines if line.arm in pooled_arms], pooled)
     return ErrorTable(
@@ -260,10 +266,10 @@ def _summarise_arm(
     )
 
 
-def _adjust(lines: Sequence[ErrorLine]) -> tuple[ErrorLine, ...]:
-    """Return the lines with p values adjusted for all arms."""
-    adjusted = adjust_p_values([line.loss for line in lines])
-    return tuple(replace(line, loss=loss) for line, loss in zip(lines, adjusted, strict=True))
+def _adjust(lines: Sequence[ErrorLine], hidden: Sequence[Difference]) -> tuple[ErrorLine, ...]:
+    """Return the lines with p values adjusted for all arms, also those that are not shown."""
+    adjusted = adjust_p_values([*(line.loss for line in lines), *hidden])
+    return tuple(replace(line, loss=loss) for line, loss in zip(lines, adjusted, strict=False))
 
 
 class _Pooled:

@@ -193,12 +193,10 @@ def finish(log: Any, report: bool, remark: str = "") -> int:
     errors = [episode for episode in log.episodes if episode["status"] == "error"]
     if errors:
         count = "1 infrastructure error" if len(errors) == 1 else f"{len(errors)} infrastructure errors"
-        first, cause = errors[0], errors[0]["error"].strip().splitlines()[-1]
-        print(
-            f"\n{count}, excluded from scores. "
-            f"The first, {first['arm']} episode {first['episode']}: {printable(cause)}",
-            file=sys.stderr,
-        )
+        print(f"\n{count}, excluded from scores. The first:", file=sys.stderr)
+        for first in {episode["arm"]: episode for episode in reversed(errors)}.values():
+            cause = first["error"].strip().splitlines()[-1]
+            print(f"{first['arm']} episode {first['episode']}: {printable(cause)}", file=sys.stderr)
         print(f"Once the cause is fixed:  wiw resume {log.path} --retry-errors", file=sys.stderr)
     print(f"\nset-up  {log.store.info.get('preparation_seconds', 0.0):.1f} s to prepare scenes and episodes")
     if log.store.shard is not None:

@@ -319,14 +319,16 @@ def _read_task(task: str, settings: ErrorSettings, parts: Sequence[Path]) -> Err
         for log in logs:
             stack.callback(log.close)
         scored = {row["arm"] for log in logs for row in log.store.outcomes() if row["status"] == "done"}
-        if not {FLOOR, CEILING} <= scored or scored.isdisjoint(settings.list_arms(task)):
+        shown = settings.list_arms(task)
+        if not {FLOOR, CEILING} <= scored or scored.isdisjoint(shown):
             return None
         return summarise_errors(
             task,
             logs[0].store.info["agents"][CEILING]["policy"],
             [row for log in logs for row in log.store.outcomes()],
             (row for log in logs for row in log.store.decisions()),
-            settings.list_arms(task),
+            shown,
             settings.list_left_out(task),
             settings.seed,
+            others=sorted(scored - {FLOOR, CEILING, *shown}),
         )

@@ -4,7 +4,7 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -37,7 +37,7 @@ class StudyPart:
     log: RunLog
     numbers: SummaryTable
     differences: tuple[Difference, ...]
-    """Differences of the pairs that the study compares, Holm-adjusted over them."""
+    """Differences of the pairs that the study compares, Holm-adjusted over those of all its runs."""
     rollouts: Mapping[str, float]
     """Imagined futures per episode, by arm."""
     quality: QualityTable | None = None
@@ -127,7 +127,7 @@ def study(
         _require(run)
     if not (folder / FILE).exists():
         _write_plan(plan, folder)
-    parts = tuple(_run(run, folder, workers, progress) for run in plan.runs)
+    parts = _adjust([_run(run, folder, workers, progress) for run in plan.runs])
     _write_plan(plan, folder)  # only now: what is there stays where a run refuses other settings
     return Study(plan, parts, folder)
 
@@ -164,8 +164,14 @@ def _run(run: StudyRun, folder: Path, workers: int, progress: bool) -> StudyPart
     return StudyPart(run, log, log.numbers(), _compare(run, log), everyone, table)
 
 
+def _adjust(parts: Sequence[StudyPart]) -> tuple[StudyPart, ...]:
+    """Return the parts with p-values adjusted for the pairs of all of them together."""
+    adjusted = iter(adjust_p_values([each for part in parts for each in part.differences]))
+    return tuple(replace(part, differences=tuple(next(adjusted) for _ in part.differences)) for part in parts)
+
+
 def _compare(run: StudyRun, log: RunLog) -> tuple[Difference, ...]:
-    """Return the differences of the study's pairs; p-values are adjusted for all of them, and for looks at the run."""
+    """Return the differences of one run's pairs; p-values hold at any look, where the run is looked at early."""
     done, _ = split_outcomes(log.arms, log.store.outcomes())
     seed, anytime = log.store.config["seed"], "until" in log.store.info
     found = [
@@ -173,4 +179,4 @@ def _compare(run: StudyRun, log: RunLog) -> tuple[Difference, ...]:
         for arm, base in run.compare
         for metric in select_metrics(done)
     ]
-    return adjust_p_values([each for each in found if each is not None])
+    return tuple(each for each in found if each is not None)

@@ -17,7 +17,7 @@ from dataclasses import dataclass, replace
 from functools import lru_cache
 from hashlib import blake2b
 from pathlib import Path
-from typing import Any, ClassVar
+from typing import TYPE_CHECKING, Any, ClassVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -34,6 +34,9 @@ from wiw.errors import ArgumentError, ContractError
 from wiw.registry import PLAN_SPACES, SOURCES
 from wiw.types import GRIPPER_POSES, PRIMITIVES, Conditioning, Control, ControlKind, View
 from wiw.world_models.pictures import check_pictures, sample
+
+if TYPE_CHECKING:
+    from typing_extensions import Self
 
 CONTROLS = ("image", "text", "trajectory", "viewpoint", "action")
 NEEDS = ("depth", "semantic", "history", "simulator")
@@ -287,7 +290,7 @@ class WorldModel(ABC):
         if "rollout" in cls.__dict__ and not isinstance(getattr(cls, "accepts", None), Accepts | property):
             raise ContractError(f"{cls.__name__}: set the class attribute `accepts = wiw.accepts(...)`")
 
-    def __new__(cls, *args: Any, **kwargs: Any) -> Any:
+    def __new__(cls, *args: Any, **kwargs: Any) -> Self:
         """Make an instance that knows what a user's class was constructed with."""
         made = super().__new__(cls)
         if not cls.__module__.startswith("wiw."):
@@ -432,7 +435,7 @@ def _is_file(path: Path) -> bool:
 
 
 def _list_arguments(
-    kind: type, args: Sequence[Any], kwargs: Mapping[str, Any]
+    kind: Any, args: Sequence[Any], kwargs: Mapping[str, Any]
 ) -> tuple[dict[str, Any], tuple[str, ...]]:
     """Return a constructor's arguments, defaults included: plain values by name, and the names of others."""
     try:

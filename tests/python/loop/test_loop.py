@@ -275,6 +275,18 @@ class Careless(Greedy):
         return super().revise(situation, proposals, scores) if self.plan is None else (self.plan, self.chosen)
 
 
+def test_policies_declare_what_they_need_in_known_words() -> None:
+    for declared, said in (
+        ({"needs": "depth"}, r"Odd\.needs: expected .*needs = \('depth',\), got 'depth'"),
+        ({"needs": ("dpeth",)}, r"Odd\.needs: .*got \('dpeth',\)"),
+        ({"frames": ("front", (96, 96))}, r"Odd\.frames: expected .*FrameSpec"),
+    ):
+        odd = type("Odd", (Greedy,), declared)()
+        for parts in ({"policy": odd}, {"policy": Greedy(), "reviser": odd}):
+            with pytest.raises(ContractError, match=said):
+                wiw.Agent(**parts, model=Stamp())
+
+
 @pytest.mark.parametrize(
     ("careless", "said"),
     [

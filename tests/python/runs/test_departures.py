@@ -204,6 +204,9 @@ def test_the_key_of_a_server_is_no_departure_and_is_told_nobody(imported) -> Non
     own = {"vlm": {**imported["vlm"], "key": "SECRET"}}
     task = AR("apartments:val")
     assert find_topics(task, policy_options=own) == find_topics(task, policy_options=imported)
+    roles = {"revise": {"model": "m", "vlm": "http://b/v1", "key": "SECRET"}}
+    found = find_topics(task, policy_options={"vlm": {**own["vlm"], "roles": roles}})
+    assert "http://b/v1" in found["roles"] and "SECRET" not in str(found)
 
 
 def test_prompts_are_the_papers_only_as_they_were_imported_for_the_task(imported) -> None:

@@ -315,6 +315,9 @@ def test_a_decision_that_could_not_be_read_again_is_refused_before_it_is_written
         decision_row("warp", bad, with_images=False)
     with pytest.raises(ContractError, match="arm warp, episode 1: cannot be recorded: metrics: success: expected"):
         outcome_row("warp", EpisodeResult(1, "0001", "line/0", "done", {"success": "yes"}))
+    for success in (2.0, -0.1, float("nan"), np.float32("inf")):
+        with pytest.raises(ContractError, match="episode 1: cannot be recorded: success: expected 0 or 1, got"):
+            outcome_row("warp", EpisodeResult(1, "0001", "line/0", "done", {"success": success}))
 
 
 def test_keys_and_tokens_of_servers_are_in_no_record(tmp_path):

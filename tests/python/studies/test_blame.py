@@ -9,6 +9,7 @@ import re
 import shutil
 import sqlite3
 from contextlib import closing
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -25,6 +26,7 @@ from wiw.errors import ArgumentError, FileError, StoreError
 from wiw.runs.recipes import AgentRecipe, TaskRecipe
 from wiw.runs.store import RunStore
 from wiw.runs.store_file import store_path
+from wiw.studies.blame import _with_ground_truth
 from wiw.studies.evaluate import evaluate, resume_run, run_arms
 
 PARTS = PYTHON_TESTS / "blame_parts.py"
@@ -120,6 +122,15 @@ def test_an_oracle_with_an_error_is_told_the_truth(two_rooms: str, tmp_path: Pat
     assert {rerun: agent["error"] for rerun, agent in agents.items()} == {
         "imagination": None, "scoring": "ignored@1", "proposals": "ignored@1", "all": None
     }  # fmt: skip
+
+
+def test_the_oracle_of_a_rerun_keeps_view_and_size() -> None:
+    recipe = AgentRecipe("matcher", "warp", model_options={"view": "perspective", "size": [48, 48]})
+    told = _with_ground_truth(recipe, ("imagination",))
+    assert (told.model, told.model_options) == ("oracle", {"view": "perspective", "size": [48, 48]})
+    own = replace(recipe, model="model.py:Mine", model_options={"view": "mine", "scale": 2})
+    assert _with_ground_truth(own, ("imagination",)).model_options == {}
+    assert _with_ground_truth(recipe, ("scoring",)).model_options == recipe.model_options
 
 
 def test_a_part_of_a_success_mends_no_failure(blamed: Any, tmp_path: Path) -> None:

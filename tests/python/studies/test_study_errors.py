@@ -111,6 +111,16 @@ def test_pairs_of_families_are_adjusted_for_each_other() -> None:
         assert 0.5 < one.p_adjusted <= 1 and not one.is_shown
 
 
+def test_arms_that_are_not_shown_count_among_the_tests(table) -> None:
+    few = {"error-lag@4": ARMS["error-lag@4"]}
+    others = [arm for arm in ARMS if arm not in few]
+    (line,) = summarise_errors("imagenav", "matcher", outcomes(), decisions(), few, others=others).lines
+    (whole,) = [each for each in table.lines if each.arm == "error-lag@4"]
+    assert line.loss.p_adjusted == whole.loss.p_adjusted > line.loss.p_value
+    (alone,) = summarise_errors("imagenav", "matcher", outcomes(), decisions(), few).lines
+    assert alone.loss.p_adjusted == alone.loss.p_value
+
+
 def test_the_words_say_what_the_numbers_do(table) -> None:
     text = " ".join(explain(table))
     assert "Errors of control cost 12.5" in text and "control costs more" in text

@@ -19,7 +19,7 @@ from wiw.cli.app import main
 from wiw.errors import ArgumentError, FileError, StoreError
 from wiw.runs.config import RunConfig
 from wiw.studies.evaluate import run_arms
-from wiw.studies.study import StudyPart, _compare
+from wiw.studies.study import StudyPart, _adjust, _compare
 from wiw.studies.study_file import list_studies, load_study, parse_variables
 
 OWN = """
@@ -261,6 +261,18 @@ def test_a_control_is_one_whatever_its_name(own: Path, tmp_path: Path) -> None:
     roles = {line.name: line.role for line in found.parts[0].numbers.arms}
     assert roles["control"] == "control: same compute, futures of another episode"
     assert roles["front"] == roles["around"] == "world model" and roles["none"].startswith("policy without")
+
+
+def test_pairs_of_all_runs_are_adjusted_together(tmp_path: Path) -> None:
+    arms = {"none": LineAgent(0.1), "warp": LineAgent(0.9)}
+    run: Any = SimpleNamespace(compare=(("warp", "none"),))
+    with closing(run_arms(LineTask(), arms, 16, out=tmp_path, progress=False)) as log:
+        part = StudyPart(run, log, log.numbers(), _compare(run, log), {})
+    (first,) = [each for each in part.differences if each.metric == "success"]
+    for count in (1, 3):
+        for own in _adjust([part] * count):
+            (found,) = [each for each in own.differences if each.metric == "success"]
+            assert found.p_adjusted == pytest.approx(min(1.0, count * first.p_value))
 
 
 def test_pairs_of_a_run_that_was_looked_at_have_the_p_of_bets(tmp_path: Path) -> None:
