@@ -24,9 +24,14 @@ from importlib.metadata import entry_points
 from pathlib import Path
 from typing import Any
 
-from wiw.errors import ConstructionError, Error, RegistryError, find_raising_line, is_stop_request
+from wiw.errors import ArgumentError, ConstructionError, Error, RegistryError, find_raising_line, is_stop_request
 from wiw.source_files import digest_imports
 from wiw.suggestions import did_you_mean
+
+CALLED_LIKE_ROLLOUT = (
+    "A function that is itself called like WorldModel.rollout needs its declaration: wiw.world_model(function, "
+    "accepts=wiw.accepts(...))."
+)
 
 
 @dataclass(frozen=True)
@@ -54,12 +59,13 @@ class Registry:
         return [*self.built_in, *sorted(({*self._list_plugins(), *self.registered}) - set(self.built_in))]
 
     def register(self, name: str, thing: Any) -> None:
-        """Add a class or factory under a name, in this process.
+        """Add a class or factory under a name, in this process; what was added under it before is replaced, as by a
+        notebook's cell that runs again.
 
         Raises:
-            RegistryError: the name is taken, or the class is of another kind.
+            RegistryError: the name is taken by wiw or a package, or the class is of another kind.
         """
-        if name in self.names():
+        if name in self.names() and name not in self.registered:
             raise RegistryError(f"the {self.kind} '{name}' already exists; choose another name")
         self.registered[name] = self._check_kind(name, thing)
 
@@ -137,7 +143,10 @@ class Registry:
             try:
                 inspect.signature(found).bind(**options)
             except TypeError as error:
-                raise RegistryError(f"{self.kind} '{what}': {error}; it takes {inspect.signature(found)}") from None
+                is_rollout = inspect.isfunction(what) and self.base.endswith(":WorldModel")
+                hint = f". {CALLED_LIKE_ROLLOUT}" if is_rollout else ""
+                takes = f"it takes {inspect.signature(found)}{hint}"
+                raise RegistryError(f"{self.kind} '{what}': {error}; {takes}") from None
         elif options:
             raise RegistryError(f"options {sorted(options)} cannot be applied to a ready-made {self.kind}")
         return found
@@ -427,6 +436,8 @@ def make(task_id: str, depth: bool = True, **options: Any) -> Any:
     Raises:
         RegistryError: unknown task, or options that do not fit; the message lists the known ones.
     """
+    if options.pop("render_mode", None) not in (None, "rgb_array"):
+        raise ArgumentError("render_mode: expected 'rgb_array'; environments draw into arrays alone")
     task, own = _make_task(task_id, options)
     return task.environment(depth=depth, **own)
 

@@ -8,7 +8,7 @@ from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from typing import Literal
 
-from wiw.errors import ContractError
+from wiw.errors import ArgumentError, ContractError
 
 
 @dataclass(frozen=True)
@@ -38,6 +38,10 @@ class Metric:
     """Name of the metric in the World-in-World paper, if it differs from the label."""
     partial: bool = False
     """Whether episodes may lack a value, with the mean over those that have one. Otherwise every episode needs one."""
+
+    def __post_init__(self) -> None:
+        if self.kind not in ("rate", "length"):
+            raise ArgumentError(f"metric '{self.name}': expected kind 'rate' or 'length', got {self.kind!r}")
 
     @property
     def scale(self) -> float:

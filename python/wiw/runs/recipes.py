@@ -23,7 +23,7 @@ from wiw.loop.imagination import Imaginer
 from wiw.loop.observers import Observer
 from wiw.policies.base import Policy
 from wiw.registry import ISOLATED, POLICIES, SEMANTICS, TRACKERS, WORLD_MODELS
-from wiw.runs.arm_text import EXAMPLE, ArmText, check_arm_name, parse_arm
+from wiw.runs.arm_text import EXAMPLE, ArmText, check_arm_name, parse_arm, split_arms
 from wiw.runs.compose import Experiment, RunContext, compose, make_for_space, require_placebo
 from wiw.runs.limits import Limits
 from wiw.runs.part_options import parse_options
@@ -474,8 +474,8 @@ def agent_recipe(agent: Any) -> AgentRecipe | AgentInMemory:
 def arm_recipes(agent: Any, arms: Any) -> dict[str, AgentRecipe | AgentInMemory]:
     """Return the same agent with each of several world models, by arm name; with its own where `arms` is None.
 
-    `arms` are texts (see `wiw.runs.arm_text`) and world models (classes or instances), or a mapping of the arms' own
-    names to these.
+    `arms` are texts (see `wiw.runs.arm_text`) and world models (classes or instances), a mapping of the arms' own
+    names to these, or one text as of the command line, such as "none,copy".
 
     Raises:
         ArgumentError: an arm is named twice, or none is; a name that is empty, has forbidden characters or is a
@@ -486,6 +486,7 @@ def arm_recipes(agent: Any, arms: Any) -> dict[str, AgentRecipe | AgentInMemory]
         return {_name_own_arm(agent, recipe): recipe}
     if not isinstance(recipe, AgentRecipe):
         raise ArgumentError(f"arms: {type(agent).__name__} has no world model to replace")
+    arms = split_arms(arms) if isinstance(arms, str) else arms
     pairs = arms.items() if isinstance(arms, Mapping) else [(None, model) for model in arms]
     made = [_make_arm(recipe, name, model) for name, model in pairs]
     if len(dict(made)) < max(1, len(made)):
@@ -509,6 +510,10 @@ def _make_arm(agent: AgentRecipe, name: str | None, model: Any) -> tuple[str, Ag
     """Return name and recipe of an arm."""
     if name is not None:
         check_arm_name(name)
+    if isinstance(model, BaseAgent | AgentRecipe | Policy):
+        raise ArgumentError(
+            f"arms: expected world models, got {type(model).__name__}; give agents runs of their own (wiw.compare)"
+        )
     if model is not None and not isinstance(model, str):
         changed = agent.with_model(model)
         return changed.arm if name is None else name, changed

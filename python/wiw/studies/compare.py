@@ -228,13 +228,13 @@ def list_unlike_budgets(a: RunLog, b: RunLog, pairs: Sequence[tuple[str, str]]) 
         if rules[0].get(name) != rules[1].get(name)
     ]
     for pair in pairs:
-        executed = [_count_executed(log, arm) for log, arm in zip((a, b), pair, strict=True)]
+        executed = [count_executed(log, arm) for log, arm in zip((a, b), pair, strict=True)]
         if None not in executed and executed[0] != executed[1]:
             found.append(f"{_label(pair[1], pair[0])} executes {executed[0]} and {executed[1]} actions per decision")
     return found
 
 
-def _count_executed(log: RunLog, arm: str) -> int | None:
+def count_executed(log: RunLog, arm: str) -> int | None:
     """Return the maximum number of actions that an arm executes per decision; None for an agent that does not say."""
     built = log.store.info.get("built", {}).get(arm, {})
     if not {"horizon", "execute"} <= built.keys():

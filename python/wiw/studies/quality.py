@@ -32,7 +32,7 @@ from wiw.analysis.quality import (
 )
 from wiw.analysis.summary import split_outcomes
 from wiw.analysis.utility import CEILING
-from wiw.errors import ArgumentError, FileError, ScorerError
+from wiw.errors import ArgumentError, FileError, ScorerError, StoreError
 from wiw.metrics import Lpips, ssim
 from wiw.metrics.metric import ANSWER_SCORE, SUCCESS, Metric
 from wiw.panorama import to_perspective
@@ -51,7 +51,7 @@ from wiw.runs.rows import to_json
 from wiw.scenes import strip_edits
 from wiw.scorers import Scorer, ScorerCard, make_scorer
 from wiw.scorers.process import DEADLINE
-from wiw.studies.compare import require_comparable
+from wiw.studies.compare import count_executed, require_comparable
 from wiw.studies.run_log import RunLog, load_run
 
 FRAMES = 200
@@ -174,6 +174,7 @@ def quality(
         for log in logs[1:]:
             require_comparable(logs[0], log)
         chosen, notes = _choose_arms(logs, arms)
+        _require_same_budget(chosen)
         keys = _choose_frames(chosen, frames)
         if len(keys) < frames:
             notes.append(
@@ -190,6 +191,19 @@ def quality(
         table = _summarise(chosen, cards, notes, logs[0])
     folder = Path(out) if out is not None else logs[0].path / "quality"
     return Quality(table, folder, _choose_pictures(chosen, keys))
+
+
+def _require_same_budget(chosen: Sequence[_Arm]) -> None:
+    """Check that all arms execute as many actions per decision, on which success depends.
+
+    Raises:
+        StoreError: they do not.
+    """
+    counts = {arm.label: count_executed(arm.log, arm.name) for arm in chosen}
+    known = {name: count for name, count in counts.items() if count is not None}
+    if len(set(known.values())) > 1:
+        said = ", ".join(f"{name} {count}" for name, count in known.items())
+        raise StoreError(f"quality: the arms execute different numbers of actions per decision: {said}; choose some")
 
 
 @contextmanager

@@ -147,14 +147,15 @@ def accepts(
     _check("control", control, CONTROLS)
     _check("view", view, ("perspective", "panorama"))
     _check("space", space, PLAN_SPACES.names())
+    needs = (needs,) if isinstance(needs, str) else needs
     for need in needs:
         _check("needs", need, NEEDS)
-    if len(size) != 2 or min(size) < 1:
-        raise ArgumentError(f"accepts: expected size (height, width) in pixels, got {size}")
-    if frames < 0 or frames == 1:
-        raise ArgumentError(f"accepts: frames includes the observation: expected 0 (any) or at least 2, got {frames}")
-    if best_batch < 1:
-        raise ArgumentError(f"accepts: expected best_batch of at least 1, got {best_batch}")
+    if not isinstance(size, Sequence) or len(size) != 2 or not all(_is_whole(side) and side >= 1 for side in size):
+        raise ArgumentError(f"accepts: expected size (height, width) in pixels, got {size!r}")
+    if not _is_whole(frames) or frames < 0 or frames == 1:
+        raise ArgumentError(f"accepts: frames includes the observation: expected 0 (any) or at least 2, got {frames!r}")
+    if not _is_whole(best_batch) or best_batch < 1:
+        raise ArgumentError(f"accepts: expected best_batch of at least 1, got {best_batch!r}")
     _check_template(template, space)
     history = _check_history(history, needs)
     size = (int(size[0]), int(size[1]))
@@ -226,6 +227,10 @@ def _check_history(history: int | None, needs: Sequence[str]) -> int:
             f"1, got {history!r}"
         )
     return int(history)
+
+
+def _is_whole(value: Any) -> bool:
+    return isinstance(value, int | np.integer) and not isinstance(value, bool)
 
 
 def _check(name: str, value: str, allowed: Sequence[str]) -> None:

@@ -40,6 +40,10 @@ SCALE = (
     "no value is above 1: floats from 0 to 1 were cast to uint8 without scaling; give np.rint(np.clip(frames, 0, 1) * "
     "255).astype(np.uint8)"
 )
+BLACK = (
+    "all is black: NaN or negative numbers were cast to uint8, or the input was overwritten; look at the floats before "
+    "the cast"
+)
 
 Picture = NDArray[np.float32]
 
@@ -68,8 +72,9 @@ def check_pictures(
         if observed.std() <= FLAT:
             continue
         bright = observed.mean() > DARK
-        if bright and max(own.max(initial=0), row[0].max()) <= 1:
-            raise ContractError(f"{name}.rollout: {SCALE}", "scale")
+        brightest = max(own.max(initial=0), row[0].max())
+        if bright and brightest <= 1:
+            raise ContractError(f"{name}.rollout: {SCALE if brightest else BLACK}", "scale")
         expected = observed.astype(np.float32)
         exact = np.array_equal(row[0], observed)
         if not exact and (fault := find_first_frame_fault(expected, row[0].astype(np.float32))):
@@ -90,7 +95,7 @@ def check_pictures(
         if are_channels_swapped(expected, own[0].astype(np.float32), least):
             raise ContractError(f"{name}.rollout: after frame 0, {CHANNELS}", "channels")
     if len(black) > 1 and not lit:
-        raise ContractError(f"{name}.rollout: after frame 0, {SCALE}", "scale")
+        raise ContractError(f"{name}.rollout: after frame 0, {BLACK}", "scale")
 
 
 def find_first_frame_fault(observed: Picture, found: Picture) -> str:

@@ -7,14 +7,15 @@ import json
 import os
 import subprocess
 import sys
+from dataclasses import replace
 from importlib.metadata import EntryPoint
 from pathlib import Path
 
 import pytest
 
 import wiw
-from wiw.errors import ConstructionError, Error, RegistryError, find_raising_line
-from wiw.registry import POLICIES, TASKS, WORLD_MODELS, Registry
+from wiw.errors import ArgumentError, ConstructionError, Error, RegistryError, find_raising_line
+from wiw.registry import METRICS, POLICIES, TASKS, WORLD_MODELS, Registry
 
 MODEL = """
 import numpy as np
@@ -148,3 +149,25 @@ def test_an_error_is_placed_at_the_line_of_its_user(tmp_path: Path) -> None:
     with pytest.raises(Error) as raised:
         wiw.world_model("copy", size="small")
     assert find_raising_line(raised.value).filename == __file__
+
+
+def test_what_was_registered_here_may_be_registered_again_and_nothing_else(monkeypatch: pytest.MonkeyPatch) -> None:
+    metrics = replace(METRICS, registered={})
+    for label in ("Near", "Nearer"):  # as by a notebook's cell that runs again
+        metrics.register("near", wiw.Metric("near", label, "rate", True))
+    assert metrics.find("near").label == "Nearer"
+    with pytest.raises(RegistryError, match="already exists"):
+        metrics.register("success", wiw.Metric("success", "SR", "rate", True))
+    with pytest.raises(ArgumentError, match="metric 'near': expected kind 'rate' or 'length', got 'percent'"):
+        wiw.Metric("near", "Near", "percent", True)
+
+
+def test_a_function_without_its_declaration_is_asked_for_it() -> None:
+    with pytest.raises(RegistryError, match=r"needs its declaration: .*accepts=wiw\.accepts"):
+        wiw.world_model(lambda observations, controls, seeds: None)
+
+
+def test_environments_are_made_as_gymnasium_makes_them(two_rooms: str) -> None:
+    assert wiw.make("ImageNav-v0", scenes=two_rooms, render_mode="rgb_array").render_mode == "rgb_array"
+    with pytest.raises(ArgumentError, match="expected 'rgb_array'"):
+        wiw.make("ImageNav-v0", scenes=two_rooms, render_mode="human")

@@ -328,7 +328,11 @@ def test_models_are_refused_that_ask_for_what_nobody_gives() -> None:
     wiw.Agent(Greedy(), model(needs=("depth",), frames=4), horizon=3)
     with pytest.raises(ArgumentError, match="size"):
         wiw.accepts(control="image", size=(480,))
+    assert wiw.accepts("image", needs="depth").needs == ("depth",)
     for declared, said in [
+        ({"control": "image", "size": 128}, r"size \(height, width\) in pixels, got 128"),
+        ({"control": "image", "frames": "14"}, "frames includes the observation: .*got '14'"),
+        ({"control": "image", "best_batch": 2.5}, "best_batch of at least 1, got 2.5"),
         ({"control": "text", "template": "prompt.txt"}, "TextTemplate"),
         ({"control": "text", "template": GripperTextTemplate()}, "TextTemplate"),
         ({"control": "text", "space": "pose7", "template": TextTemplate()}, "GripperTextTemplate"),

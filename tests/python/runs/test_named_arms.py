@@ -99,6 +99,7 @@ def test_arms_share_the_options_of_their_agent_and_have_their_own(shade):
         ({"a,b": "copy"}, "contains ','"),
         ({"a\nb": "copy"}, "contains"),
         ({"a": "b=copy"}, "is named both 'a' and 'b'"),
+        ({"a": wiw.Agent("matcher", "copy")}, r"expected world models, got Agent; .*wiw\.compare"),
     ],
 )
 def test_wrong_arms_are_refused_with_a_hint(arms, message):
@@ -131,3 +132,9 @@ def test_two_checkpoints_of_one_model_are_two_arms_of_a_run(shade, two_rooms, tm
     assert "name them:" in capsys.readouterr().err and not (tmp_path / "wrong").exists()
     with pytest.raises(RegistryError, match="unexpected keyword"):
         wiw.evaluate("imagenav", AgentRecipe("heuristic"), 1, scenes=two_rooms, arms=["a=copy?speed=3"], out="wrong")
+
+
+def test_arms_in_one_text_are_those_of_the_command_line():
+    text = "none,copy,small=warp?size=[144, 256]"
+    assert arm_recipes(AgentRecipe("matcher"), text) == arm_recipes(AgentRecipe("matcher"), split_arms(text))
+    assert list(arm_recipes(AgentRecipe("matcher"), text)) == ["none", "copy", "small"]

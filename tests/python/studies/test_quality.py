@@ -528,6 +528,25 @@ def test_what_cannot_be_compared_is_refused(
         wiw.quality([run, other])
 
 
+def test_arms_that_execute_other_numbers_of_actions_are_refused(two_rooms: str, tmp_path: Path) -> None:
+    runs = []
+    for execute in (1, 2):
+        runs.append(
+            wiw.evaluate(
+                "imagenav",
+                wiw.Agent("matcher", "copy", execute=execute),
+                1,
+                out=tmp_path / str(execute),
+                progress=False,
+                scenes=two_rooms,
+                decisions=2,
+                keep_images=1,
+            )
+        )
+    with pytest.raises(StoreError, match=r"different numbers of actions per decision: .*copy 1, .*copy 2"):
+        wiw.quality(runs, frames=2)
+
+
 def test_a_file_that_holds_no_scores_is_named(run: Path) -> None:
     forget_scores(run)
     (run / "quality.sqlite").write_bytes(b"no database at all, but long enough to look at" * 10)
