@@ -345,11 +345,10 @@ class WorldModel(ABC):
     def describe(self) -> dict[str, Any]:
         """Return a JSON-able identity for the run's manifest: the class and its options.
 
-        Default: arguments of the constructor and public attributes that are plain values (numbers, text, paths, lists
-        and mappings of them); networks and arrays are left out. Override it to say what they were loaded from.
+        Default: public attributes that are plain values (numbers, text, paths, lists and mappings of them); networks
+        and arrays are left out. Override it to say what they were loaded from.
         """
         public = {name: value for name, value in vars(self).items() if not name.startswith("_") and _is_plain(value)}
-        public = {**self._constructed_with[0], **public}
         options = {name: str(value) if isinstance(value, Path) else value for name, value in public.items()}
         return {"name": type(self).__name__, **options}
 
@@ -376,19 +375,26 @@ class WorldModel(ABC):
         That is one without a `version`, or one made with an object that is no plain value, network of torch or array
         and whose class does not override `describe()`.
 
-        It covers the class, its version, `identity()` and the content of `files()`; for a class in a file
-        (`path.py:Class`), the name and content of that file and of those next to it that it imports, wherever they
-        are. Where a user's class does not override `describe()`, the parameters of torch networks in its attributes
-        count, too. Anything else that outputs depend on belongs in `describe()`.
+        It covers the class, its version, `identity()`, the plain arguments of a user's constructor (which may be
+        secret, and are not described) and the content of `files()`; for a class in a file (`path.py:Class`), the name
+        and content of that file and of those next to it that it imports, wherever they are. Where a user's class does
+        not override `describe()`, the parameters of torch networks in its attributes count, too. Anything else that
+        outputs depend on belongs in `describe()`.
         """
         kind = type(self)
         describes_itself = kind.describe is not WorldModel.describe
         if not self.version or not (describes_itself or all(map(self._is_held, self._constructed_with[1]))):
             return ""
         module = getattr(sys.modules.get(kind.__module__), SOURCES, kind.__module__)
-        known = [module, kind.__qualname__, self.version, self.identity()]
+        files = list(self.files())
+        given = {
+            name: value
+            for name, value in self._constructed_with[0].items()
+            if name not in self.immaterial and not (isinstance(value, str | Path) and Path(value).expanduser() in files)
+        }
+        known = [module, kind.__qualname__, self.version, self.identity(), *([given] if given else [])]
         digest = blake2b(json.dumps(known, sort_keys=True, default=str).encode(), digest_size=20)
-        for file in self.files():
+        for file in files:
             status = file.stat()
             digest.update(_file_digest(file.resolve(), status.st_size, status.st_mtime_ns))
         if not describes_itself and not kind.__module__.startswith("wiw."):

@@ -363,9 +363,12 @@ def test_arguments_of_the_constructor_count_though_no_attribute_holds_them(tmp_p
     made = [Constructed(), Constructed(gain=0.1), Constructed(file), Constructed(shift=2)]
     names = [model.fingerprint() for model in made]
     assert len(set(names)) == 4 and "" not in names and Constructed(gain=1.0).fingerprint() == names[0]
+    (tmp_path / "copy.pt").write_bytes(b"one")
+    assert Constructed(tmp_path / "copy.pt").fingerprint() == names[2], "on another machine it may lie elsewhere"
     file.write_bytes(b"two")
     assert made[2].fingerprint() != names[2] and made[2].files() == [file]
-    assert made[1].describe()["gain"] == 0.1 and pickle.loads(pickle.dumps(made[1])).fingerprint() == names[1]
+    assert Constructed(key="SECRET").describe() == {"name": "Constructed"}, "records are shown and passed on"
+    assert pickle.loads(pickle.dumps(made[1])).fingerprint() == names[1]
     assert Constructed(other=object()).fingerprint() == "", "nobody can tell it from others"
     own = type("Own", (Constructed,), {"describe": lambda self: {"name": "Own"}})
     assert own(other=object()).fingerprint()
