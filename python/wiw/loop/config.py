@@ -54,7 +54,7 @@ class AgentConfig(PlanConfig):
         for name in ("candidates", "horizon", "depth", "width", "pool"):
             value = getattr(self, name)
             if value is not None and not (isinstance(value, Integral) and int(value) >= 1):
-                raise ArgumentError(f"agent: expected {name} as a whole number of at least 1, got {value!r}")
+                raise ArgumentError(f"agent: expected {name} of at least 1, got {value!r}")
         if not isinstance(self.execute, Integral | None):
             raise ArgumentError(f"agent: expected execute as a whole number, got {self.execute!r}")
         if self.execute is not None and self.horizon is not None and self.execute < -self.horizon:

@@ -40,10 +40,7 @@ SCALE = (
     "no value is above 1: floats from 0 to 1 were cast to uint8 without scaling; give np.rint(np.clip(frames, 0, 1) * "
     "255).astype(np.uint8)"
 )
-BLACK = (
-    "all is black: NaN or negative numbers were cast to uint8, or the input was overwritten; look at the floats before "
-    "the cast"
-)
+BLACK = f"{SCALE}. All is black, as after NaN or negative numbers were cast, or the input was overwritten"
 
 Picture = NDArray[np.float32]
 
