@@ -16,7 +16,7 @@ from wiw.world_models.base import WorldModel
 from wiw.world_models.oracle import Oracle
 
 OBSERVED = ("depth", "wrist")
-"""What a policy can need of an observation besides images and odometry."""
+"""Names of what a policy can need of an observation besides images and odometry."""
 
 
 class PlanChecker(Protocol):

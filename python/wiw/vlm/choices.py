@@ -63,8 +63,6 @@ def read_logprobs(
         [value for token, value in listed if token.strip(LETTER_CONTEXT) == label and value > -math.inf]
         for label in labels
     ]
-    if not any(found):
-        return None
     if sum(math.exp(value) for values in found for value in values) < LEAST_MASS:
         return None
     left = 1.0 - float(sum(np.exp(value) for _, value in listed))

@@ -221,7 +221,7 @@ def _check_history(history: int | None, needs: Sequence[str]) -> int:
         return 0
     if history is None:
         return HISTORY
-    if isinstance(history, bool) or not isinstance(history, int | np.integer) or history < 1:
+    if not _is_whole(history) or history < 1:
         raise ArgumentError(
             "accepts: history includes the observation: with needs=('history',), expected a whole number of at least "
             f"1, got {history!r}"
