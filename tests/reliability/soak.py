@@ -40,12 +40,29 @@ class Held:
     episodes: int
     megabytes: float
     """Resident memory, once the allocator has given back what is free: how much it keeps varies by tens of MB."""
+    in_use: float
+    """What malloc has handed out and not got back, in MB: a leak shows here, free pages that malloc keeps do not."""
     descriptors: int
     threads: int
     shared: int
     """Files in /dev/shm."""
     temporary: int
     """Files and folders where temporary files belong."""
+
+
+class MallInfo(ctypes.Structure):
+    """Counts of glibc's `mallinfo2`, in the order of its manual page."""
+
+    NAMES = ("arena", "ordblks", "smblks", "hblks", "hblkhd", "usmblks", "fsmblks", "uordblks", "fordblks", "keepcost")
+    _fields_ = tuple((name, ctypes.c_size_t) for name in NAMES)
+
+
+def count_bytes_in_use() -> int:
+    """Return the bytes that malloc has handed out, in its arenas and by mmap."""
+    libc = ctypes.CDLL(None)
+    libc.mallinfo2.restype = MallInfo
+    info = libc.mallinfo2()
+    return int(info.uordblks + info.hblkhd)
 
 
 def measure(begin: float, episodes: int) -> Held:
@@ -56,6 +73,7 @@ def measure(begin: float, episodes: int) -> Held:
         time.monotonic() - begin,
         episodes,
         pages * 4096 / 1e6,
+        count_bytes_in_use() / 1e6,
         len(list(Path("/proc/self/fd").iterdir())),
         threading.active_count(),
         len(list(Path("/dev/shm").iterdir())),
@@ -104,10 +122,10 @@ def switch_scenes(scenes: list[str], switches: int) -> list[Held]:
     return held
 
 
-def fit_slope(held: list[Held], over: str) -> float:
+def fit_slope(held: list[Held], over: str, memory: str = "megabytes") -> float:
     """Return the growth of memory in MB per second or episode, without the first quarter, in which caches fill."""
     rest = held[len(held) // 4 :]
-    return float(np.polyfit([getattr(each, over) for each in rest], [each.megabytes for each in rest], 1)[0])
+    return float(np.polyfit([getattr(each, over) for each in rest], [getattr(each, memory) for each in rest], 1)[0])
 
 
 def list_left(held: list[Held]) -> dict[str, int]:
@@ -138,6 +156,7 @@ def report(name: str, held: list[Held]) -> dict[str, Any]:
         "minutes": round(held[-1].seconds / 60, 1),
         "MB at first, at the end": (round(held[0].megabytes), round(held[-1].megabytes)),
         "MB per hour": round(3600 * fit_slope(held, "seconds"), 2),
+        "MB in use per hour": round(3600 * fit_slope(held, "seconds", "in_use"), 2),
         f"MB per 1000 {name}": round(1000 * fit_slope(held, "episodes"), 3),
         "left": list_left(held),
         "temporary files": held[-1].temporary - held[0].temporary,
