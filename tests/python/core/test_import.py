@@ -25,11 +25,15 @@ print(json.dumps({"seconds": seconds, "modules": sorted(m for m in sys.modules i
 
 
 def test_import_takes_no_heavy_module() -> None:
-    answer = json.loads(
-        subprocess.run([sys.executable, "-c", PROBE], capture_output=True, check=True, text=True).stdout
-    )
-    assert not {"torch", "torchvision", "cv2", "matplotlib", "scipy", "gymnasium"} & set(answer["modules"])
-    assert answer["seconds"] < 0.3
+    answers = [json.loads(run_python("-c", PROBE)) for _ in range(3)]
+    assert not {"torch", "torchvision", "cv2", "matplotlib", "scipy", "gymnasium"} & set(answers[0]["modules"])
+    assert min(answer["seconds"] for answer in answers) < 0.3  # other work on the machine makes single ones longer
+
+
+def run_python(*arguments: str) -> str:
+    done = subprocess.run([sys.executable, *arguments], check=False, capture_output=True, text=True)
+    assert done.returncode == 0, done.stdout + done.stderr
+    return done.stdout
 
 
 def test_every_public_name_is_there() -> None:
@@ -40,7 +44,7 @@ def test_every_public_name_is_there() -> None:
 
 @pytest.mark.slow
 def test_editors_know_the_types_of_what_names_make(tmp_path: Path) -> None:
-    api = pytest.importorskip("mypy.api")
+    pytest.importorskip("mypy")
     names = {
         'wiw.make("ImageNav-v0")': "wiw.GymnasiumEnv",
         'wiw.policy("matcher")': "wiw.policies.base.Policy",
@@ -49,6 +53,6 @@ def test_editors_know_the_types_of_what_names_make(tmp_path: Path) -> None:
     }
     file = tmp_path / "typed.py"
     file.write_text("import wiw\n" + "".join(f"reveal_type({call})\n" for call in names))
-    said, errors, code = api.run([str(file), "--follow-imports=silent", f"--cache-dir={tmp_path / 'cache'}"])
-    assert code == 0, said + errors
+    # In a process of its own: the millions of objects that mypy leaves would slow down every garbage collection after.
+    said = run_python("-m", "mypy", str(file), "--follow-imports=silent", f"--cache-dir={tmp_path / 'cache'}")
     assert re.findall(r'Revealed type is "([^"]*)"', said) == list(names.values())
