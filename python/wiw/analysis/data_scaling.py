@@ -8,14 +8,17 @@ trainings are paired.
 from __future__ import annotations
 
 import math
+from collections import Counter
 from collections.abc import Mapping, Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
+from itertools import permutations
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from wiw.analysis.statistics import Estimate
+from wiw.analysis.flip_test import flip_signs
+from wiw.analysis.statistics import LEVEL, Estimate, holm
 from wiw.errors import ArgumentError
 
 ONE_EPOCH, EQUAL_UPDATES, FEWER_SCENES = "one epoch", "equal updates", "fewer scenes"
@@ -24,6 +27,10 @@ clips from fewer scenes."""
 RESAMPLES = 999
 EXPONENTS = np.linspace(0.01, 3, 300)
 """Exponents that a fit chooses from."""
+MOST_ORDERED = 7
+"""Sizes up to which the trend test tries all their orders."""
+DRAWN_ORDERS = 20_000
+"""Orders that it draws at random beyond that."""
 
 SceneSums = Mapping[str, Sequence[float]]
 """Sum and number of values in each scene."""
@@ -36,11 +43,6 @@ class Value:
     value: float
     low: float
     high: float
-
-    @property
-    def excludes_zero(self) -> bool:
-        """Whether the interval lies on one side of zero."""
-        return self.low > 0 or self.high < 0
 
 
 @dataclass(frozen=True)
@@ -63,12 +65,14 @@ class Draws:
 
 @dataclass(frozen=True)
 class Trend:
-    """Page's test: does a measure fall, scene by scene, from each size to the next larger one?"""
+    """Page's test over trainings: does a measure fall, seed by seed, from each size to the next larger one?"""
 
     statistic: float
     p: float
-    """One-sided: how often chance alone orders the sizes so well."""
-    scenes: int
+    """One-sided: how often chance alone orders the trainings of each seed so well."""
+    least_p: float
+    """The p of trainings in perfect order: so few trainings cannot show more."""
+    trainings: int
 
 
 @dataclass(frozen=True)
@@ -134,6 +138,14 @@ class Curve:
     trend: Trend | None
     fit: PowerLaw | None
     """Both of primary measures over numbers of clips alone."""
+    gain_p: float | None = None
+    """Of primary measures over numbers of scenes alone: two-sided p of no gain, by flipping the signs of whole seeds,
+    Holm-adjusted for all models and primary measures."""
+
+    @property
+    def is_gain_shown(self) -> bool:
+        """Whether the adjusted test over trainings finds a difference between the fewest and all scenes."""
+        return self.gain_p is not None and self.gain_p <= LEVEL
 
 
 @dataclass(frozen=True)
@@ -220,12 +232,6 @@ class Resampled:
         """Return the mean of a training for each seed."""
         return [float(value) for value in self._sums[name].sum(axis=1) / self._counts[name].sum(axis=1)]
 
-    def by_scene(self, name: str) -> NDArray[np.float64]:
-        """Return the means of a training in each scene, over seeds; NaN without a value."""
-        counts = self._counts[name]
-        means = self._sums[name] / np.where(counts > 0, counts, np.nan)
-        return np.asarray(means.mean(axis=0), np.float64)
-
     def _arrange(self, tables: Sequence[SceneSums], part: int) -> NDArray[np.float64]:
         return np.array([[table.get(scene, (0.0, 0.0))[part] for scene in self.scenes] for table in tables])
 
@@ -233,17 +239,44 @@ class Resampled:
 def measure_trend(means: Resampled, names: Sequence[str]) -> Trend:
     """Test whether a measure falls over trainings, from the first to the last.
 
-    Page's L (1963) over scenes, in each of which the trainings are ranked; p from all orders where they are few, else
-    from the normal approximation (scipy).
-    """
-    from scipy.stats import page_trend_test
+    The unit is a training. In each seed, the trainings are ranked by their means over all scenes; the statistic is
+    Page's L (1963). If the sizes make no difference, the trainings of a seed are as likely to come in any other order,
+    which gives p: exact up to `MOST_ORDERED` sizes, also with equal values, and from orders drawn at random beyond.
+    Scenes are those measured, the same for all trainings: p is of what another training would do in them.
 
-    table = np.stack([means.by_scene(name) for name in names], axis=1)
-    table = table[np.isfinite(table).all(axis=1)]
-    if len(table) < 2 or len(names) < 3:
-        return Trend(math.nan, math.nan, len(table))
-    found = page_trend_test(-table)
-    return Trend(float(found.statistic), float(found.pvalue), len(table))
+    Args:
+        means: of all trainings.
+        names: of the trainings, from few clips to many.
+    """
+    from scipy.stats import rankdata
+
+    table = np.array([means.by_seed(name) for name in names], np.float64).T  # [seeds, sizes]
+    if len(names) < 3 or not np.isfinite(table).all():
+        return Trend(math.nan, math.nan, math.nan, table.size)
+    ranks = rankdata(-table, axis=1)
+    statistic = float((ranks @ np.arange(1, len(names) + 1)).sum())
+    perfect = np.tile(np.arange(1.0, len(names) + 1), (len(table), 1))
+    best = float((perfect**2).sum())
+    return Trend(statistic, _find_trend_p(ranks, statistic), _find_trend_p(perfect, best), table.size)
+
+
+def _find_trend_p(ranks: NDArray[np.float64], statistic: float) -> float:
+    """Return how often L is at least `statistic` if the ranks [seeds, sizes] of each seed come in any order."""
+    if ranks.shape[1] > MOST_ORDERED:
+        rng = np.random.Generator(np.random.Philox(key=0))
+        places = np.arange(1, ranks.shape[1] + 1)
+        drawn = rng.permuted(np.tile(ranks, (DRAWN_ORDERS, 1, 1)), axis=-1) @ places
+        return float((1 + (drawn.sum(axis=1) >= statistic).sum()) / (1 + DRAWN_ORDERS))
+    totals = Counter({0.0: 1})  # ranks are whole or half numbers, so that their sums are exact
+    for row in ranks:
+        orders = Counter(
+            sum(place * rank for place, rank in enumerate(order, 1)) for order in permutations(row.tolist())
+        )
+        wider: Counter[float] = Counter()
+        for (total, count), (more, times) in ((a, b) for a in totals.items() for b in orders.items()):
+            wider[total + more] += count * times
+        totals = wider
+    return sum(count for total, count in totals.items() if total >= statistic) / sum(totals.values())
 
 
 def fit_power_law(sizes: Sequence[int], values: Sequence[Draws]) -> PowerLaw:
@@ -301,7 +334,9 @@ def summarise_scaling(
         name: Resampled({training: [table[name] for table in seeds] for training, seeds in measures.items()})
         for name in names
     }
-    curves = tuple(_draw_curve(arm, name, resampled[name], name in primary) for arm in arms for name in names)
+    curves = _test_scene_gains(
+        [_draw_curve(arm, name, resampled[name], name in primary) for arm in arms for name in names], primary
+    )
     splits = tuple(
         ModelSplit(arm.model, name, _split_arm(resampled[name], arm, arms))
         for name in primary
@@ -323,6 +358,14 @@ def _draw_curve(arm: ScalingArm, measure: str, means: Resampled, primary: bool) 
         measure_trend(means, arm.trainings) if judged else None,
         fit_power_law(arm.amounts, drawn) if judged else None,
     )
+
+
+def _test_scene_gains(curves: Sequence[Curve], primary: Mapping[str, str]) -> tuple[Curve, ...]:
+    """Return the curves with the p of what all scenes gain over the fewest, where it is primary."""
+    tested = [curve for curve in curves if curve.arm.name == FEWER_SCENES and curve.measure in primary]
+    raw = [flip_signs(np.array(curve.by_seed[0]) - np.array(curve.by_seed[-1])) for curve in tested]
+    adjusted = {id(curve): float(p) for curve, p in zip(tested, holm(raw), strict=True)}
+    return tuple(replace(curve, gain_p=adjusted[id(curve)]) if id(curve) in adjusted else curve for curve in curves)
 
 
 def _split_arm(means: Resampled, short: ScalingArm, arms: Sequence[ScalingArm]) -> Split:

@@ -20,6 +20,7 @@ from wiw.analysis.data_scaling import (
     ScalingTable,
     Value,
 )
+from wiw.analysis.statistics import LEVEL
 from wiw.analysis.summary import show_estimate, show_p
 from wiw.report.tables import ROOMY, print_stacked
 
@@ -108,8 +109,9 @@ def explain(table: ScalingTable) -> list[str]:
         f"For comparison, {name}: " + ", ".join(f"{measure} {value:.3g}" for measure, value in values.items()) + "."
         for name, values in table.references.items()
     ]
+    lines += _describe_least_p(table)
     lines.append(
-        f"Intervals: 95 %, over scenes and {table.seeds} seed{'' if table.seeds == 1 else 's'} resampled together; "
+        f"Intervals: 95 %, over scenes and {_count(table.seeds, 'seed')} resampled together; "
         + ("one seed says nothing about other seeds." if table.seeds == 1 else "so few seeds are a rough guide.")
     )
     return lines
@@ -178,23 +180,41 @@ def _describe_split(found: ModelSplit) -> str:
     split, form = found.split, _choose_form(found.split.total.value)
     who = f"{found.model}, {found.measure}"
     if split.verdict == "no gain":
-        return f"{who}: from the smallest to the largest size there is no significant gain, so nothing to split."
+        return (
+            f"{who}: the interval of the gain from the smallest to the largest size is not above 0: nothing to split."
+        )
     return (
         f"{who}: of the gain of {show_interval(split.total, form)} from the smallest to the largest size, "
         f"{show_interval(split.share, '.0f')} % is reached by the smallest size when trained as long: {split.verdict}."
     )
 
 
+def _describe_least_p(table: ScalingTable) -> list[str]:
+    """Return what the trend test can show at best; nothing where no curve was tested."""
+    trends = [each.trend for each in table.curves if each.trend is not None and not math.isnan(each.trend.p)]
+    return [
+        f"p of a trend is over trainings, exact within seeds: {number} trainings cannot show less than p "
+        f"{show_p(least)}{', so no trend can be shown' if least > LEVEL else ''}."
+        for number, least in dict.fromkeys((each.trainings, each.least_p) for each in trends)
+    ]
+
+
 def _describe_scene_gain(curve: Curve) -> str:
     form = _choose_form(curve.gain.value)
-    verdict = "" if curve.gain.excludes_zero else ", which may be chance"
+    verdict = "" if curve.is_gain_shown else ": this may be chance"
+    seeds = len(curve.by_seed[0])
+    test = "" if curve.gain_p is None else f" (p {show_p(curve.gain_p)} over {_count(seeds, 'seed')}, adjusted)"
     few, whole = curve.arm.amounts[0], curve.arm.amounts[-1]
     return (
         f"{curve.arm.model}, {curve.measure}: as many clips from all {whole} scenes instead of {few} gain "
-        f"{show_interval(curve.gain, form)}{verdict}."
+        f"{show_interval(curve.gain, form)}{test}{verdict}."
     )
 
 
 def count_trainings(curves: Sequence[Curve]) -> int:
     """Return the number of different trainings, each seed counted."""
     return len({name for curve in curves for name in curve.arm.trainings}) * len(curves[0].by_seed[0])
+
+
+def _count(number: int, noun: str) -> str:
+    return f"{number} {noun}" if number == 1 else f"{number} {noun}s"

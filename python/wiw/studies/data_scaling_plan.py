@@ -25,12 +25,15 @@ REGISTERED = (
     "255, rows weighted by the cosine of their latitude, averaged over frames from another place than the observation; "
     "and regret, how many metres further from the goal the plan ends whose imagined end looks most like the goal than "
     "the best plan does. Everything else is secondary.",
-    "Trend: Page's test over scenes, one-sided, of each primary measure falling over the sizes, in the arms of one "
-    "epoch and of equal updates; level 0.05, without correction for several tests.",
+    "Trend: Page's test over trainings, one-sided, of each primary measure falling over the sizes, in the arms of one "
+    "epoch and of equal updates: sizes are ranked in each seed, p is from all orders of the trainings within seeds; "
+    "level 0.05, without correction for several tests.",
     "Split: of the gain from the smallest to the largest size at one epoch, the part that the smallest size gains when "
     "it is trained for as many updates as the largest is due to updates, the rest to data. Where the 95 % interval of "
     "the updates' share lies above 50 %, the curve is mostly updates; below, mostly data; else it is undecided.",
-    "Scenes: the difference between the same number of clips from the fewest and from all scenes, at equal updates.",
+    "Scenes: the difference between the same number of clips from the fewest and from all scenes, at equal updates; "
+    "shown where a two-sided test that flips the signs of whole seeds, Holm-adjusted for all models and both primary "
+    "measures, has p of at most 0.05.",
     "Intervals: 95 %, percentiles over scenes and seeds drawn anew together, all trainings paired.",
 )
 """Rules that are settled before the first training."""

@@ -3,7 +3,9 @@
 
 from __future__ import annotations
 
+import itertools
 import json
+import math
 import shutil
 from dataclasses import asdict, replace
 from pathlib import Path
@@ -19,15 +21,19 @@ from wiw.analysis.data_scaling import (
     FEWER_SCENES,
     ONE_EPOCH,
     Resampled,
+    ScalingArm,
+    ScalingTable,
     Success,
     fit_power_law,
     measure_trend,
     split_gain,
+    summarise_scaling,
 )
 from wiw.analysis.statistics import estimate_mean
 from wiw.cli import main
 from wiw.errors import ArgumentError, FileError
 from wiw.metrics.metric import SUCCESS
+from wiw.report.data_scaling_tables import explain
 
 pytest.importorskip("pyarrow", reason="needs wiw[export]")
 torch = pytest.importorskip("torch", reason="needs wiw[torch]")
@@ -108,11 +114,75 @@ def test_a_fit_is_as_good_as_that_of_a_general_optimiser() -> None:
 
 def test_a_trend_is_one_that_falls() -> None:
     rng = np.random.default_rng(0)
-    falling = {str(row): [tables(5 - row + rng.normal(0, 0.1, 8))] for row in range(4)}
+    falling = {str(row): [tables(5 - row + rng.normal(0, 0.1, 8)) for _ in range(4)] for row in range(4)}
     names = list(falling)
     assert measure_trend(Resampled(falling), names).p < 1e-4
     assert measure_trend(Resampled(falling), names[::-1]).p > 0.99
     assert np.isnan(measure_trend(Resampled(falling), names[:2]).p)  # of two sizes there is none
+
+
+def draw_trainings(rng: Any, seeds: int, sizes: int, apart: float = 0.0) -> Resampled:
+    """Trainings that differ by chance, each alike in all scenes; `apart` is what a size gains over the one before."""
+    scenes, hard = rng.normal(0, 3, 12), rng.normal(0, 1, seeds)
+    return Resampled(
+        {
+            str(size): [
+                tables(30 - apart * size + hard[seed] + rng.normal(0, 0.3) + scenes + rng.normal(0, 0.05, 12))
+                for seed in range(seeds)
+            ]
+            for size in range(sizes)
+        }
+    )
+
+
+def test_what_trainings_differ_by_chance_is_no_trend() -> None:
+    """Trainings vary more than their means over scenes are uncertain, so that each scene orders them alike."""
+    rng, names = np.random.default_rng(0), [str(size) for size in range(4)]
+    found = [measure_trend(draw_trainings(rng, 2, 4), names).p for _ in range(1500)]
+    assert np.mean(np.array(found) <= 0.05) <= 0.05 + 3 * np.sqrt(0.05 * 0.95 / 1500)
+    assert np.mean(np.array(found) <= 0.05) >= 0.02, "a test of nothing never rejects"
+    assert np.mean([measure_trend(draw_trainings(rng, 2, 4, 0.5), names).p <= 0.05 for _ in range(200)]) > 0.9
+
+
+@pytest.mark.parametrize(("seeds", "sizes"), [(2, 3), (2, 4), (3, 5)])
+def test_the_trend_test_is_that_of_scipy_over_trainings(seeds: int, sizes: int) -> None:
+    from scipy.stats import page_trend_test
+
+    rng, names = np.random.default_rng(seeds), [str(size) for size in range(sizes)]
+    for apart in (0.0, 0.1, 0.3):
+        means = draw_trainings(rng, seeds, sizes, apart)
+        own = measure_trend(means, names)
+        peer = page_trend_test(-np.array([means.by_seed(name) for name in names]).T, method="exact")
+        assert own.statistic == peer.statistic and own.p == pytest.approx(peer.pvalue)
+        assert own.trainings == seeds * sizes
+
+
+@pytest.mark.parametrize(("seeds", "sizes"), [(1, 3), (1, 4), (2, 4)])
+def test_the_least_p_of_so_few_trainings_is_that_of_one_order_among_all(seeds: int, sizes: int) -> None:
+    means = draw_trainings(np.random.default_rng(0), seeds, sizes, 10.0)
+    found = measure_trend(means, [str(size) for size in range(sizes)])
+    assert found.p == found.least_p == pytest.approx(math.factorial(sizes) ** -seeds)
+
+
+def test_equal_trainings_share_their_rank() -> None:
+    """With ties, p is the share of all orders of the shared ranks, tried one by one."""
+    values = [[3.0, 2.0, 2.0], [3.0, 3.0, 1.0]]
+    means = Resampled({str(size): [tables([own[size]] * 3) for own in values] for size in range(3)})
+    found = measure_trend(means, ["0", "1", "2"])
+    ranks = [[1, 2.5, 2.5], [1.5, 1.5, 3]]
+    orders = [np.array(order) for order in itertools.product(*(itertools.permutations(row) for row in ranks))]
+    seen = float((np.array(ranks) @ (1, 2, 3)).sum())
+    assert found.statistic == seen
+    assert found.p == pytest.approx(np.mean([(order @ (1, 2, 3)).sum() >= seen for order in orders]))
+
+
+def test_many_sizes_are_ordered_at_random() -> None:
+    from scipy.stats import page_trend_test
+
+    means, names = draw_trainings(np.random.default_rng(4), 2, 9, 0.05), [str(size) for size in range(9)]
+    found = measure_trend(means, names)
+    peer = page_trend_test(-np.array([means.by_seed(name) for name in names]).T, method="exact").pvalue
+    assert 0.01 < peer < 0.99 and found.p == pytest.approx(peer, abs=4 * np.sqrt(peer * (1 - peer) / 20_000))
 
 
 @pytest.mark.parametrize(
@@ -147,6 +217,34 @@ def test_draws_of_scenes_without_a_value_are_left_out() -> None:
     found = means.mean("a")
     assert np.isnan(found.drawn).any()
     assert found.interval().low >= 5 and found.interval().high <= 6
+
+
+def make_scene_table(seeds: int, gains: dict[str, float]) -> ScalingTable:
+    """Models of which ten scenes gain so much over two, alike in every scene and seed."""
+    arms, measures = [], {}
+    for model, gain in gains.items():
+        settings = [f"{model} {amount}" for amount in (1, 2, 3)]
+        arms += [
+            ScalingArm(model, name, (1, 2, 3), 3, (1, 2, 3), tuple(settings)) for name in (ONE_EPOCH, EQUAL_UPDATES)
+        ]
+        arms.append(ScalingArm(model, FEWER_SCENES, (2, 10), 3, (3, 3), (settings[0], settings[-1])))
+        for row, setting in enumerate(settings):
+            measures[setting] = [
+                {"error": tables(20 - gain * (row == 2) + 0.01 * seed + np.arange(8))} for seed in range(seeds)
+            ]
+    return summarise_scaling(arms, measures, {"error": "error"}, {})
+
+
+@pytest.mark.parametrize(("seeds", "p"), [(2, 1.0), (6, 2 * 2 / 2**6), (7, 2 * 2 / 2**7)])
+def test_scenes_are_said_to_gain_where_the_adjusted_test_over_trainings_finds_it(seeds: int, p: float) -> None:
+    """However surely two trainings differ in the scenes measured, so few may do so by chance."""
+    table = make_scene_table(seeds, {"warpnet": 3.0, "pocket": 3.0})
+    curves = [table.find_curve(model, FEWER_SCENES, "error") for model in table.models]
+    assert all(curve.gain.low > 2.9 for curve in curves)
+    assert [curve.gain_p for curve in curves] == pytest.approx([p, p])
+    said = [line for line in explain(table) if "instead of 2 gain" in line]
+    assert ["this may be chance" in line for line in said] == [p > 0.05] * 2
+    assert table.find_curve("warpnet", ONE_EPOCH, "error").gain_p is None
 
 
 # -- the plan ----------------------------------------------------------------------------------------------------------
@@ -299,6 +397,7 @@ def test_the_page_shows_verdicts_figure_and_plan(study: DataScaling, tmp_path: P
         "Page&#39;s test",
         "equal updates",
         "8 scenes",
+        "6 trainings cannot show less than p 0.028",
     ):
         assert expected in text
     numbers = json.loads(pages[3].read_text())
