@@ -58,6 +58,8 @@ class ErrorLine:
     """Success rate, or score of answers, in percent."""
     loss: Difference
     """Arm minus oracle."""
+    over_none: Difference | None
+    """Arm minus none, paired: what is left of the gain of true futures. P is adjusted for all arms."""
     actions: Difference | None
     """The same in the number of actions."""
     regret: Difference | None
@@ -76,6 +78,13 @@ class Cost:
     """Points of the outcome."""
     regret: Estimate | None
     arms: int
+    p_adjusted: float
+    """P of no loss, Holm-adjusted for all costs of the table."""
+
+    @property
+    def is_shown(self) -> bool:
+        """Whether the errors are shown to cost, or to gain, anything."""
+        return self.p_adjusted <= LEVEL
 
 
 @dataclass(frozen=True)
@@ -93,7 +102,7 @@ class CostGap:
     @property
     def is_shown(self) -> bool:
         """Whether one family is shown to cost more than the other."""
-        return self.p_adjusted <= LEVEL and self.loss.excludes_zero
+        return self.p_adjusted <= LEVEL
 
 
 @dataclass(frozen=True)
@@ -160,10 +169,11 @@ def summarise_errors(
         for metric in (ANSWER_SCORE, SUCCESS)
         if all(metric.name in row["metrics"] for own in done.values() for row in own.values())
     )
-    hidden = [compare(arm, CEILING, done, metric, seed) for arm in others if done[arm] and done[CEILING]]
+    hidden = [arm for arm in others if done[arm] and done[CEILING]]
     lines = _adjust(
         [_summarise_arm(arm, *arms[arm], done, measured, metric, seed) for arm in shown],
-        [each for each in hidden if each is not None],
+        [compare(arm, CEILING, done, metric, seed) for arm in hidden],
+        [compare(arm, FLOOR, done, metric, seed) for arm in hidden],
     )
     pooled = _Pooled(pooled_arms, sorted(scored), done, measured, metric, seed)
     costs, gaps = _list_costs([line for line in lines if line.arm in pooled_arms], pooled)
@@ -260,16 +270,32 @@ def _summarise_arm(
         ERRORS[kind].unit,
         _estimate(done[arm], metric, seed),
         loss,
+        compare(arm, FLOOR, done, metric, seed),
         compare(arm, CEILING, done, MEAN_TRAJECTORY, seed),
         compare(arm, CEILING, done, REGRET, seed),
         measures,
     )
 
 
-def _adjust(lines: Sequence[ErrorLine], hidden: Sequence[Difference]) -> tuple[ErrorLine, ...]:
-    """Return the lines with p values adjusted for all arms, also those that are not shown."""
-    adjusted = adjust_p_values([*(line.loss for line in lines), *hidden])
-    return tuple(replace(line, loss=loss) for line, loss in zip(lines, adjusted, strict=False))
+def _adjust(
+    lines: Sequence[ErrorLine], hidden: Sequence[Difference | None], hidden_over_none: Sequence[Difference | None]
+) -> tuple[ErrorLine, ...]:
+    """Return the lines with p values adjusted for all arms, also those that are not shown: against the oracle, and
+    against none.
+    """
+    losses = _adjust_family([*(line.loss for line in lines), *hidden])
+    over_none = _adjust_family([*(line.over_none for line in lines), *hidden_over_none])
+    found = []
+    for line, loss, over in zip(lines, losses, over_none, strict=False):
+        assert loss is not None
+        found.append(replace(line, loss=loss, over_none=over))
+    return tuple(found)
+
+
+def _adjust_family(differences: Sequence[Difference | None]) -> list[Difference | None]:
+    """Return the differences adjusted for each other, in their places; those without common episodes are None."""
+    adjusted = iter(adjust_p_values([each for each in differences if each is not None]))
+    return [None if each is None else next(adjusted) for each in differences]
 
 
 class _Pooled:
@@ -370,9 +396,12 @@ def _list_costs(lines: Sequence[ErrorLine], pooled: _Pooled) -> tuple[tuple[Cost
         for family, own in known.items():
             loss = pooled.estimate_loss(own)
             if loss is not None:
-                costs.append(Cost(family, measure, loss, pooled.estimate_regret(own), int((own != 0).sum())))
+                arms = int((own != 0).sum())
+                costs.append(Cost(family, measure, loss, pooled.estimate_regret(own), arms, pooled.test_loss(own)))
         if measure != METRES:
             gaps += _list_gaps(known, measure, pooled)
+    adjusted = holm([each.p_adjusted for each in costs])
+    costs = [replace(each, p_adjusted=float(p)) for each, p in zip(costs, adjusted, strict=True)]
     return tuple(costs), tuple(gaps)
 
 

@@ -9,7 +9,7 @@ from collections.abc import Mapping, Sequence
 from rich.console import Console
 from rich.text import Text
 
-from wiw.analysis.errors import METRES, PSNR, STEP, Cost, CostGap, ErrorLine, ErrorTable
+from wiw.analysis.errors import CEILING, METRES, PSNR, STEP, Cost, CostGap, ErrorLine, ErrorTable
 from wiw.analysis.statistics import LEVEL, Difference, Estimate
 from wiw.analysis.summary import show_estimate, show_p
 from wiw.experiments.errors.kinds import ERRORS
@@ -18,7 +18,9 @@ from wiw.report.tables import ROOMY, print_stacked
 
 ABOUT: Mapping[str, str] = {
     "minus oracle": "Paired difference from the same agent with true futures, in points.",
-    "p": "Sign-flip test of this difference over scenes, Holm-adjusted over all arms.",
+    "p": "Test of this difference over scenes, Holm-adjusted over all arms.",
+    "minus none": "Paired difference from the agent without imagination: what is left of the gain of foresight.",
+    "p (none)": "Test of this difference over scenes, Holm-adjusted over all arms; of the oracle on its own.",
     "regret": "The reviser's score of the best true future minus that of the chosen plan's, minus the oracle's.",
     "actions": "Executed actions per episode, minus the oracle's.",
     "1 - SSIM": "Dissimilarity of imagined and true frames, as the reviser sees them.",
@@ -26,20 +28,21 @@ ABOUT: Mapping[str, str] = {
     "PSNR": "PSNR of imagined and true frames, dB; 100 for equal ones.",
     "metres": "Distance of the imagined camera, or gripper, from its true place.",
 }
-COST_TITLES = ("points lost", "regret", "arms")
+COST_TITLES = ("points lost", "p", "regret", "arms")
 GAP_TITLES = ("points", "p", "regret")
 
 
 def list_titles(table: ErrorTable) -> list[str]:
     """Return the titles of the table of arms."""
-    return [table.label, "minus oracle", "p", "regret", "actions", *_list_measures(table)]
+    return [table.label, "minus oracle", "p", "minus none", "p (none)", "regret", "actions", *_list_measures(table)]
 
 
 def list_lines(table: ErrorTable) -> list[tuple[str, list[str]]]:
     """Return name and cells of each arm, under `list_titles`."""
-    empty = [""] * (len(list_titles(table)) - 1)
-    references = [(arm, [show_estimate(found), *empty]) for arm, found in table.references.items()]
-    return [*references, *((line.arm, _show_line(line, table)) for line in table.lines)]
+    return [
+        *((arm, _show_reference(arm, found, table)) for arm, found in table.references.items()),
+        *((line.arm, _show_line(line, table)) for line in table.lines),
+    ]
 
 
 def list_costs(table: ErrorTable) -> list[tuple[str, list[str]]]:
@@ -47,7 +50,7 @@ def list_costs(table: ErrorTable) -> list[tuple[str, list[str]]]:
     return [
         (
             f"{each.family}, per {_name_step(each.measure)}",
-            [show_estimate(each.loss), _show(each.regret), f"{each.arms}"],
+            [show_estimate(each.loss), show_p(each.p_adjusted), _show(each.regret), f"{each.arms}"],
         )
         for each in table.costs
     ]
@@ -92,6 +95,7 @@ def explain(table: ErrorTable) -> list[str]:
         )
     else:
         found.append("No single arm is significantly below the oracle, adjusted for all arms.")
+    found += _describe_over_none(table)
     if table.left_out:
         found.append(f"Left out, as they make no sense in {table.task}: {', '.join(table.left_out)}.")
     found.append(
@@ -122,6 +126,24 @@ def _list_measures(table: ErrorTable) -> list[str]:
     return [name for name in (table.distance, PSNR, METRES) if name in known]
 
 
+def _show_reference(arm: str, outcome: Estimate, table: ErrorTable) -> list[str]:
+    """Return the cells of none or the oracle, of which only the oracle is compared with none."""
+    cells = [show_estimate(outcome), *[""] * (len(list_titles(table)) - 1)]
+    if arm == CEILING:
+        cells[3:5] = _show_over_none(table.gain)
+    return cells
+
+
+def _show_over_none(found: Difference | None) -> list[str]:
+    """Return the cells of a difference from none and its p; the oracle's is a single test, which nothing adjusts."""
+    if found is None:
+        return ["–", "–"]
+    return [
+        show_estimate(found.estimate, signed=True),
+        show_p(found.p_value if found.arm == CEILING else found.p_adjusted),
+    ]
+
+
 def _show_line(line: ErrorLine, table: ErrorTable) -> list[str]:
     forms = {PSNR: ".1f"}
     measures = [
@@ -132,6 +154,7 @@ def _show_line(line: ErrorLine, table: ErrorTable) -> list[str]:
         show_estimate(line.outcome),
         show_estimate(line.loss.estimate, signed=True),
         show_p(line.loss.p_adjusted),
+        *_show_over_none(line.over_none),
         _show_difference(line.regret, ".3f"),
         _show_difference(line.actions, ".1f"),
         *measures,
@@ -159,11 +182,25 @@ def _is_loss(line: ErrorLine) -> bool:
 
 
 def _describe_cost(found: Cost, label: str) -> str:
-    sure = "" if found.loss.excludes_zero else ", which may be chance"
+    sure = "" if found.is_shown else ": this may be chance"
     return (
         f"Errors of {found.family} cost {show_estimate(found.loss)} points of {label} per {_name_step(found.measure)} "
-        f"({found.arms} {'arm' if found.arms == 1 else 'arms'}){sure}."
+        f"({found.arms} {'arm' if found.arms == 1 else 'arms'}; p {show_p(found.p_adjusted)}, adjusted for all costs)"
+        f"{sure}."
     )
+
+
+def _describe_over_none(table: ErrorTable) -> list[str]:
+    """Return which arms are surely better, and which worse, than no imagination at all."""
+    shown = [
+        (line.arm, line.over_none.estimate.value) for line in table.lines if line.over_none and line.over_none.is_shown
+    ]
+    above, below = [arm for arm, value in shown if value > 0], [arm for arm, value in shown if value < 0]
+    return [
+        f"Significantly {side} none, adjusted for all arms: {', '.join(arms)}."
+        for side, arms in (("above", above), ("below", below))
+        if arms
+    ] or ["No arm is significantly above or below none, adjusted for all arms."]
 
 
 def _describe_gap(found: CostGap) -> str:

@@ -11,11 +11,13 @@ import numpy as np
 import pytest
 
 from wiw.analysis.errors import METRES, summarise_errors
+from wiw.analysis.intervals import clustered_interval
+from wiw.analysis.statistics import holm
 from wiw.cli import main
 from wiw.errors import ArgumentError, StoreError
 from wiw.experiments.errors.kinds import ERRORS
 from wiw.report.error_page import write_errors
-from wiw.report.error_tables import explain, list_lines, print_errors
+from wiw.report.error_tables import explain, list_lines, list_titles, print_errors
 from wiw.studies.errors import ErrorSettings, make_recipes, read_errors, study_errors
 
 ARMS = {"error-blur@64": ("blur", 64.0), "error-lag@2": ("lag", 2.0), "error-lag@4": ("lag", 4.0)}
@@ -119,6 +121,60 @@ def test_arms_that_are_not_shown_count_among_the_tests(table) -> None:
     assert line.loss.p_adjusted == whole.loss.p_adjusted > line.loss.p_value
     (alone,) = summarise_errors("imagenav", "matcher", outcomes(), decisions(), few).lines
     assert alone.loss.p_adjusted == alone.loss.p_value
+
+
+def test_every_arm_is_paired_with_none_and_adjusted_for_all_arms(table) -> None:
+    """The gain of true futures is 100 points, of which blur leaves all and lag half."""
+    p_values = [line.over_none.p_value for line in table.lines]
+    for line, expected in zip(table.lines, holm(p_values), strict=True):
+        assert line.over_none.estimate.value == pytest.approx(100 - 100 * COST[line.arm])
+        assert line.over_none.p_adjusted == pytest.approx(expected) and line.over_none.base == "none"
+    cells = dict(list_lines(table))
+    column = list_titles(table).index("minus none")
+    assert cells["oracle"][column].startswith("+100.0 [") and cells["none"][column] == ""
+    assert cells["error-lag@4"][column].startswith("+50.0 [")
+    few = {"error-lag@4": ARMS["error-lag@4"]}
+    (line,) = summarise_errors("imagenav", "matcher", outcomes(), decisions(), few, others=["error-blur@64"]).lines
+    assert line.over_none.p_adjusted == pytest.approx(2 * line.over_none.p_value)
+    assert "Significantly above none, adjusted for all arms: error-blur@64, error-lag@2, error-lag@4." in explain(table)
+
+
+def test_an_arm_below_none_is_said_to_be() -> None:
+    rows = outcomes()
+    for row in rows:
+        if row["arm"] in ("none", "error-lag@4"):
+            row["metrics"]["success"] = float(row["arm"] == "none")
+    said = explain(summarise_errors("imagenav", "matcher", rows, decisions(), ARMS))
+    assert "Significantly below none, adjusted for all arms: error-lag@2, error-lag@4." in said
+    alike = [{**row, "metrics": {"success": 1.0, "actions": 10.0}} for row in rows]
+    said = explain(summarise_errors("imagenav", "matcher", alike, decisions(), ARMS))
+    assert "No arm is significantly above or below none, adjusted for all arms." in said
+
+
+def test_costs_are_stated_by_the_test_that_is_adjusted_for_all_of_them(table) -> None:
+    control = next(cost for cost in table.costs if cost.family == "control")
+    assert control.loss.excludes_zero and control.is_shown
+    assert not any("may be chance" in line and "control cost" in line for line in explain(table))
+    unsure = explain(replace(table, costs=(replace(control, p_adjusted=0.06),)))
+    assert any("p 0.060, adjusted for all costs): this may be chance" in line for line in unsure)
+
+
+def test_the_p_of_a_cost_is_that_of_its_interval_adjusted_for_all_costs() -> None:
+    """Alone, p is 1 - the confidence at which the interval of what is lost ends at 0."""
+    arms = {"error-blur@64": ("blur", 64.0), "error-lag@2": ("lag", 2.0), "error-flicker@20": ("flicker", 20.0)}
+    cut = [row for row in outcomes() if row["episode"] in (*range(4), *range(10, 26))]  # 4 of 20 episodes are lost
+    rows = [*cut, *({**row, "arm": "error-flicker@20"} for row in cut if row["arm"] == "error-lag@2")]
+    measured = {"ssim": [0.8], "psnr": [90.0], "regret": 0.5}  # the distance of lag@2, and no error of poses
+    looked = [*decisions(), *({"arm": "error-flicker@20", "episode": i, "fidelity": measured} for i in range(EPISODES))]
+    (alone,) = summarise_errors("imagenav", "matcher", rows, looked, {"error-flicker@20": ("flicker", 20.0)}).costs
+    lost = [float(row["episode"] < 10) for row in cut if row["arm"] == "none"]
+    scenes = [row["scene"] for row in cut if row["arm"] == "none"]
+    low, _ = clustered_interval(lost, scenes, "difference", confidence=1 - alone.p_adjusted)
+    assert sum(lost) == 4 and low == pytest.approx(0, abs=1e-6) and 0.01 < alone.p_adjusted < 0.25
+    found = {(each.family, each.measure): each for each in summarise_errors("imagenav", "", rows, looked, arms).costs}
+    assert len(found) == 4
+    for family, measure in (("flicker", "1 - SSIM"), ("control", "1 - SSIM"), ("control", METRES)):
+        assert found[family, measure].p_adjusted == pytest.approx(4 * alone.p_adjusted)
 
 
 def test_the_words_say_what_the_numbers_do(table) -> None:
