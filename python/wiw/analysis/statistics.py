@@ -36,6 +36,8 @@ class Estimate:
     value: float
     low: float
     high: float
+    """Both ends are NaN where no interval is known: of the length of a single episode, and of lengths that are all
+    equal at the end of their range, such as 0, which do not show how far apart lengths may lie."""
     n: int
     """Episodes."""
     scenes: int
@@ -187,6 +189,7 @@ def compare(
     )
 
 
+NO_SPREAD = "unknown: all values are equal, at the end of their range"
 _OVER_SCENES = {"rate": "Wilson", "difference": "Tango", "length": "Student t"}
 _OVER_EPISODES: dict[Kind, Callable[[NDArray[np.float64], Interval], Interval]] = {
     "rate": lambda data, reach: wilson(float(data.mean()), len(data)),
@@ -202,7 +205,9 @@ def _estimate(
 ) -> Estimate:
     groups, scale = len(set(scenes)), metric.scale
     second, name = None, _OVER_SCENES[kind]
-    if groups > 1:
+    if kind == "length" and not reach[1] > reach[0]:  # nothing says how far apart values may lie
+        name, low, high = NO_SPREAD, math.nan, math.nan
+    elif groups > 1:
         name = f"{name} over {groups} scenes"
         low, high = clustered_interval(data, list(scenes), kind, reach=reach)
         bootstrap = clustered_bootstrap(data, list(scenes), seed=seed)

@@ -573,6 +573,7 @@ def notes(summary: Summary) -> list[str]:
         )
     found += [_describe_missing(line) for line in summary.arms if line.done < line.total]
     found += [*_explain_intervals(summary), *_explain_differences(summary), *_explain_utility(summary)]
+    found += _explain_unknown(summary)
     found += summary.marks.describe() if summary.marks is not None else []
     found += _explain_partial(summary)
     found += [SPL_RULE] if summary.marks is None and SPL.name in {each.name for each in list_columns(summary)} else []
@@ -632,6 +633,15 @@ def _explain_intervals(summary: Summary) -> list[str]:
     elif first.scenes < FEWEST_SCENES:
         few = " With so few scenes they are wide: add scenes rather than episodes per scene."
     return [f"95 % intervals over {first.scenes} scenes.{few}"]
+
+
+def _explain_unknown(summary: Summary) -> list[str]:
+    """Return why an interval is not known, where that is so."""
+    estimates = [estimate for line in summary.arms for estimate in line.estimates.values()]
+    estimates += [difference.estimate for difference in summary.differences]
+    if not any(math.isnan(estimate.low) for estimate in estimates):
+        return []
+    return ["[?]: unknown, as lengths of one episode, or that are all 0, do not show how far apart lengths may lie."]
 
 
 def _explain_differences(summary: Summary) -> list[str]:

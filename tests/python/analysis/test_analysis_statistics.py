@@ -10,6 +10,7 @@ from hypothesis import strategies as st
 from rich.console import Console
 from scipy import stats
 
+import wiw
 from wiw.analysis.flip_test import DRAWS, approximate_flips, find_p_value, flip_signs
 from wiw.analysis.intervals import (
     clustered_bootstrap,
@@ -24,7 +25,7 @@ from wiw.analysis.intervals import (
     tango,
     wilson,
 )
-from wiw.analysis.statistics import compare, estimate_difference, estimate_mean, holm
+from wiw.analysis.statistics import compare, compute_p_value, estimate_difference, estimate_mean, holm
 from wiw.analysis.summary import load_metrics, notes, show_estimate, summarise
 from wiw.errors import ArgumentError
 from wiw.report.page import sentence, summary_html
@@ -331,6 +332,37 @@ def test_lengths_that_are_all_alike_are_no_certainty():
     one = estimate_mean([60.0] * 4, ["a"] * 4, TRAJ)
     assert one.low < 50 and one.high > 70
     assert math.isnan(estimate_mean([3.0], ["a"], TRAJ).low)
+
+
+@pytest.mark.parametrize("scenes", [["a"] * 6, list("aabbcc"), list("abcdef")])
+def test_lengths_that_are_all_the_least_have_an_unknown_interval_and_not_one_of_no_width(scenes):
+    """Six paths of 0 m are no certainty of 0 m, and nothing says how long a seventh may be."""
+    unbounded = wiw.Metric("bonus", "Bonus", "length", True)
+    for found in (
+        estimate_mean([0.0] * 6, scenes, TRAJ),
+        estimate_difference([0.0] * 6, [0.0] * 6, scenes, TRAJ),
+        estimate_mean([7.0] * 6, scenes, unbounded),
+    ):
+        assert math.isnan(found.low) and math.isnan(found.high) and found.bootstrap is None
+        assert not found.excludes_zero and "all values are equal" in found.method
+    assert compute_p_value([0.0] * 6, [0.0] * 6, scenes, TRAJ) == 1
+    known = estimate_mean([0.0] * 5 + [1.0], scenes, TRAJ)
+    assert known.low == 0 and known.high > 0.3
+
+
+def test_an_unknown_interval_is_explained():
+    rows = [outcome(arm, i, float(i % 2), actions=0.0) for arm in ("none", "oracle") for i in range(6)]
+    text = " ".join(shown(SummaryTable.of(summarise(["none", "oracle"], rows, 6))).split())
+    assert "0.0 [?]" in text and "[?]: unknown, as lengths of one episode, or that are all 0" in text
+    moving = summarise(["none"], [outcome("none", i, 1.0) for i in range(6)], 6)
+    assert "[?]" not in shown(SummaryTable.of(moving))
+
+
+@pytest.mark.parametrize("value", [0.0, 0.5, 1.0])
+@pytest.mark.parametrize("scenes", [["a"] * 6, list("aabbcc"), list("abcdef")])
+def test_rates_that_are_all_alike_are_never_narrower_than_wilson_over_episodes(value, scenes):
+    found, (low, high) = estimate_mean([value] * 6, scenes, SPL), wilson(value, 6)
+    assert found.low <= 100 * low + 1e-9 and found.high >= 100 * high - 1e-9
 
 
 def test_unequal_scenes_count_as_fewer():
