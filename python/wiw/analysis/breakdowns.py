@@ -72,6 +72,14 @@ class Breakdown:
         return {key: {arm: found[key] for arm, found in self.estimates.items() if key in found} for key in self.keys}
 
     @property
+    def counts(self) -> dict[str, str]:
+        """By row, the number of episodes (`unit`) that its estimates are over, e.g. "12"; "9-12" where they differ."""
+        counts = {name: {one.n for one in row.values()} for name, row in self.rows.items()}
+        return {
+            name: f"{min(own)}" if len(own) == 1 else f"{min(own)}-{max(own)}" for name, own in counts.items() if own
+        }
+
+    @property
     def corner(self) -> str:
         """Heading of the rows."""
         return self.key_name if self.arms_across else f"arm minus {self.base}" if self.base else "arm"

@@ -42,6 +42,9 @@ COLUMNS = (
     ),
     Column("SSIM", "Structural similarity of the same frames.", "ssim", ".3f"),
     Column("LPIPS", "Perceptual distance of perspective views of 256x256; lower is better.", "lpips", ".3f"),
+    Column("n", "Decisions whose plans were replayed, the basis of all but SR.", "decisions", "d"),
+    Column("n rank", "Those whose plans can be ranked.", "ranked", "d"),
+    Column("n regret", "Those that chose one of the replayed plans, so that it has a regret.", "chosen", "d"),
 )
 
 
@@ -61,6 +64,10 @@ class ArmFidelity:
     psnr: float
     ssim: float
     lpips: float
+    ranked: int
+    """Replayed decisions that have a rank."""
+    chosen: int
+    """Replayed decisions that have a regret."""
 
     def cells(self, columns: Sequence[Column]) -> list[str]:
         """Return the cells of the table."""
@@ -97,12 +104,18 @@ def _summarise_arm(run: Run, arm: str) -> ArmFidelity | None:
         _average([value for one in found for value in one["psnr"]]),
         _average([value for one in found for value in one["ssim"]]),
         _average([value for one in found for value in one.get("lpips", ())]),
+        _count_known([one["rank"] for one in found]),
+        _count_known([one["regret"] for one in found]),
     )
 
 
 def _average(values: Sequence[float | None]) -> float:
     known = [value for value in values if value is not None and math.isfinite(value)]
     return float(np.mean(known)) if known else math.nan
+
+
+def _count_known(values: Sequence[float | None]) -> int:
+    return sum(value is not None and math.isfinite(value) for value in values)
 
 
 def _format(value: float, form: str) -> str:

@@ -22,19 +22,32 @@ ABOUT: Mapping[str, str] = {
     "minus none": "Paired difference from the agent without imagination: what is left of the gain of foresight.",
     "p (none)": "Test of this difference over scenes, Holm-adjusted over all arms; of the oracle on its own.",
     "regret": "The reviser's score of the best true future minus that of the chosen plan's, minus the oracle's.",
+    "n": "Episodes that are scored in the arm and in the oracle.",
+    "n (regret)": "Episodes in which regret was measured in both; of costs, in all arms of the family.",
     "actions": "Executed actions per episode, minus the oracle's.",
     "1 - SSIM": "Dissimilarity of imagined and true frames, as the reviser sees them.",
     "LPIPS": "Perceptual distance of imagined and true views of 256x256 pixels.",
     "PSNR": "PSNR of imagined and true frames, dB; 100 for equal ones.",
     "metres": "Distance of the imagined camera, or gripper, from its true place.",
 }
-COST_TITLES = ("points lost", "p", "regret", "arms")
-GAP_TITLES = ("points", "p", "regret")
+COST_TITLES = ("points lost", "p", "regret", "n (regret)", "arms")
+GAP_TITLES = ("points", "p", "regret", "n (regret)")
 
 
 def list_titles(table: ErrorTable) -> list[str]:
     """Return the titles of the table of arms."""
-    return [table.label, "minus oracle", "p", "minus none", "p (none)", "regret", "actions", *_list_measures(table)]
+    return [
+        table.label,
+        "minus oracle",
+        "p",
+        "minus none",
+        "p (none)",
+        "n",
+        "regret",
+        "n (regret)",
+        "actions",
+        *_list_measures(table),
+    ]
 
 
 def list_lines(table: ErrorTable) -> list[tuple[str, list[str]]]:
@@ -50,7 +63,13 @@ def list_costs(table: ErrorTable) -> list[tuple[str, list[str]]]:
     return [
         (
             f"{each.family}, per {_name_step(each.measure)}",
-            [show_estimate(each.loss), show_p(each.p_adjusted), _show(each.regret), f"{each.arms}"],
+            [
+                show_estimate(each.loss),
+                show_p(each.p_adjusted),
+                _show(each.regret),
+                _count(each.regret),
+                f"{each.arms}",
+            ],
         )
         for each in table.costs
     ]
@@ -61,7 +80,7 @@ def list_gaps(table: ErrorTable) -> list[tuple[str, list[str]]]:
     return [
         (
             f"{each.family} - {each.base}, per {_name_step(each.measure)}",
-            [show_estimate(each.loss, signed=True), show_p(each.p_adjusted), _show(each.regret)],
+            [show_estimate(each.loss, signed=True), show_p(each.p_adjusted), _show(each.regret), _count(each.regret)],
         )
         for each in table.gaps
     ]
@@ -155,10 +174,17 @@ def _show_line(line: ErrorLine, table: ErrorTable) -> list[str]:
         show_estimate(line.loss.estimate, signed=True),
         show_p(line.loss.p_adjusted),
         *_show_over_none(line.over_none),
+        f"{line.loss.estimate.n}",
         _show_difference(line.regret, ".3f"),
+        _count(line.regret.estimate if line.regret else None),
         _show_difference(line.actions, ".1f"),
         *measures,
     ]
+
+
+def _count(found: Estimate | None) -> str:
+    """Return the episodes that an estimate is over."""
+    return "–" if found is None else f"{found.n}"
 
 
 def _show_difference(found: Difference | None, form: str) -> str:

@@ -244,7 +244,7 @@ def _make_breakdown_tables(breakdown: Breakdown, gap: str, width: int) -> list[T
 
     columns = [Column(title, [format_cell(name, title) for name in rows]) for title in breakdown.columns]
     count = "n" if breakdown.unit == "episodes" else breakdown.unit
-    columns.append(Column(count, [str(max(one.n for one in row.values())) for row in rows.values()]))
+    columns.append(Column(count, list(breakdown.counts.values())))
     return stack_tables(breakdown.title, list(rows), columns, width, breakdown.corner)
 
 

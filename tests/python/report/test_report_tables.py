@@ -12,6 +12,7 @@ from fakes import LineAgent, LineTask
 from rich.console import Console
 
 from wiw.analysis.costs import COLUMNS, costs
+from wiw.analysis.fidelity import choose_columns, fidelity
 from wiw.analysis.summary import show_estimate, summarise
 from wiw.cli import main
 from wiw.report import tables
@@ -19,6 +20,7 @@ from wiw.report.page import summary_html
 from wiw.report.tables import SummaryTable
 from wiw.runs.store_file import store_path
 from wiw.studies.evaluate import run_arms
+from wiw.types import TableSpec
 
 ARMS = ("none", "copy", "warp", "placebo-shuffled:a_model_with_a_long_name", "oracle")
 FIDELITY = {"scores": [0.25, 0.5], "rank": 0.5, "regret": 0.125, "best": False, "psnr": [21.5] * 2, "ssim": [0.75] * 2}
@@ -80,6 +82,45 @@ def test_fidelity_is_printed_where_it_was_measured(log, terminal, tmp_path, caps
     assert all(number in shown.split() for number in ("0.50", "0.125", "21.5", "0.750"))
     plain = run_arms(LineTask(), {"none": LineAgent()}, 2, out=tmp_path / "plain", progress=False)
     assert terminal(80, lambda: tables.print_fidelity(plain)) == ""
+
+
+def test_fidelity_says_over_how_many_decisions_each_mean_is(tmp_path):
+    log = run_arms(LineTask(), {"warp": LineAgent(0.3)}, 5, out=tmp_path / "run", progress=False)
+    unranked, replanned = {**FIDELITY, "rank": None}, {**FIDELITY, "rank": None, "regret": None, "best": None}
+    with sqlite3.connect(store_path(log.path)) as store:
+        store.execute("UPDATE decision SET fidelity = NULL")
+        for episode, found in enumerate((FIDELITY, FIDELITY, unranked, replanned)):
+            row = (json.dumps(found), episode)
+            changed = store.execute("UPDATE decision SET fidelity = ? WHERE episode = ? AND decision = 0", row)
+            assert changed.rowcount == 1
+    (line,) = fidelity(log)
+    assert (line.decisions, line.ranked, line.chosen) == (4, 2, 3)
+    columns = choose_columns([line])
+    cells = dict(zip((column.title for column in columns), line.cells(columns), strict=True))
+    assert (cells["n"], cells["n rank"], cells["n regret"]) == ("4", "2", "3") and cells["regret"] == "0.125"
+
+
+@pytest.mark.parametrize("width", [60, 140])
+def test_a_breakdown_says_how_many_episodes_its_arms_have(width):
+    """One arm lacks three of six episodes of a kind, so that its number is not the other's."""
+    rows = [
+        {"arm": arm, "episode": i, "scene": f"s{i}", "status": "done", "metrics": {"success": 1.0}, "task": kind}
+        for arm in ("none", "half")
+        for i, kind in enumerate(["near"] * 6 + ["far"] * 4)
+        if arm == "none" or i >= 3
+    ]
+    spec = TableSpec(kinds=("success",), kind="category")
+    found = SummaryTable.of(summarise(["none", "half"], rows, 10, tables=spec))
+    (breakdown,) = found.breakdowns
+    assert breakdown.counts == {"near": "3-6", "far": "4"}
+    console = Console(width=width, file=io.StringIO(), record=True)
+    console.print(found)
+    assert any(
+        line.split()[0] == "near" and line.split()[-1] == "3-6"
+        for line in console.export_text().splitlines()
+        if line.strip()
+    )
+    assert '<td class="number">3-6</td>' in summary_html(found)
 
 
 def test_the_end_of_a_run_prints_fidelity(log, capsys):

@@ -17,7 +17,16 @@ from wiw.cli import main
 from wiw.errors import ArgumentError, StoreError
 from wiw.experiments.errors.kinds import ERRORS
 from wiw.report.error_page import write_errors
-from wiw.report.error_tables import explain, list_lines, list_titles, print_errors
+from wiw.report.error_tables import (
+    COST_TITLES,
+    GAP_TITLES,
+    explain,
+    list_costs,
+    list_gaps,
+    list_lines,
+    list_titles,
+    print_errors,
+)
 from wiw.studies.errors import ErrorSettings, make_recipes, read_errors, study_errors
 
 ARMS = {"error-blur@64": ("blur", 64.0), "error-lag@2": ("lag", 2.0), "error-lag@4": ("lag", 4.0)}
@@ -25,6 +34,7 @@ DISTANCE = {"error-blur@64": 0.5, "error-lag@2": 0.2, "error-lag@4": 0.4}
 COST = {"error-blur@64": 0.0, "error-lag@2": 0.25, "error-lag@4": 0.5}
 """Share of the successes that an arm loses: nothing by blur, in proportion to the distance by lag."""
 EPISODES = 40
+CONTROL = ("control, per 0.1 in 1 - SSIM", "control, per 0.1 m")
 SETTINGS = {"episodes": EPISODES, "seed": 0, "fidelity_share": 0.25}
 
 
@@ -149,6 +159,17 @@ def test_an_arm_below_none_is_said_to_be() -> None:
     alike = [{**row, "metrics": {"success": 1.0, "actions": 10.0}} for row in rows]
     said = explain(summarise_errors("imagenav", "matcher", alike, decisions(), ARMS))
     assert "No arm is significantly above or below none, adjusted for all arms." in said
+
+
+def test_regret_says_in_how_many_episodes_it_was_measured() -> None:
+    few = [row for row in decisions() if row["episode"] < 12 or row["arm"] != "error-lag@4"]
+    found = summarise_errors("imagenav", "matcher", outcomes(), few, ARMS)
+    column = list_titles(found).index("n (regret)")
+    cells = {arm: (own[column - 2], own[column]) for arm, own in list_lines(found)}
+    assert cells["error-lag@4"] == ("40", "12") and cells["error-blur@64"] == ("40", "40") and cells["none"] == ("", "")
+    costs = {name: own[COST_TITLES.index("n (regret)")] for name, own in list_costs(found)}
+    assert costs == {"looks, per 0.1 in 1 - SSIM": "40", **dict.fromkeys(CONTROL, "12")}
+    assert [own[GAP_TITLES.index("n (regret)")] for _, own in list_gaps(found)] == ["12"]
 
 
 def test_costs_are_stated_by_the_test_that_is_adjusted_for_all_of_them(table) -> None:
