@@ -8,7 +8,7 @@ from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Any
 
-from wiw.analysis.statistics import Difference, Estimate, adjust_p_values, compare, estimate_mean
+from wiw.analysis.statistics import Difference, Estimate, Units, adjust_p_values, compare, estimate_mean
 from wiw.metrics.metric import SUCCESS, Metric
 from wiw.types import Episode
 
@@ -216,7 +216,7 @@ def read_anytime_curve(done: Done, cuts: Cuts, seed: int) -> list[Breakdown]:
 
 
 def compare_anytime_curves(
-    done: Done, pairs: Iterable[tuple[str, str]], cuts: Cuts, seed: int, anytime: bool = False
+    done: Done, pairs: Iterable[tuple[str, str]], cuts: Cuts, seed: int, units: Units | None = None
 ) -> list[Breakdown]:
     """Return paired differences of the anytime curve, a table per base.
 
@@ -225,7 +225,7 @@ def compare_anytime_curves(
         pairs: arms and what each is compared with.
         cuts: where, and which score.
         seed: of the bootstrap.
-        anytime: whether the test must hold however often the run was looked at before it was stopped.
+        units: of a run that was looked at before it was stopped, see `wiw.analysis.statistics.compare`.
     """
     found: dict[str, dict[tuple[str, str], Difference]] = {}
     for arm, base in pairs:
@@ -233,7 +233,7 @@ def compare_anytime_curves(
             at = cuts.make_metric(cut)
             both = [o["metrics"] for name in (arm, base) for o in done[name].values()]
             known = all(at.name in each for each in both)
-            difference = compare(arm, base, done, at, seed, anytime) if known else None
+            difference = compare(arm, base, done, at, seed, units) if known else None
             if difference is not None:
                 found.setdefault(base, {})[arm, str(cut)] = difference
     return [_tabulate_anytime_differences(base, cells, cuts) for base, cells in found.items()]

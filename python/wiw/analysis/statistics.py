@@ -25,6 +25,8 @@ from wiw.analysis.intervals import (
 )
 from wiw.metrics.metric import SUCCESS, Metric
 
+Units = Sequence[Sequence[int]]
+"""Episodes of each unit that bets are made on: a complete scene, or an episode where there is only one scene."""
 LEVEL = 0.05
 """Adjusted p up to which a difference counts as shown."""
 
@@ -99,14 +101,14 @@ def compute_p_value(arm: ArrayLike, base: ArrayLike, scenes: Sequence[str], metr
     return find_p_value(data, scenes, kind, reach, seed=seed)
 
 
-def _compute_anytime_p(arm: ArrayLike, base: ArrayLike, scenes: Sequence[str], metric: Metric) -> float:
-    """Return the p that holds at any look, over means of scenes in their order; of a single scene, over episodes."""
+def _compute_anytime_p(arm: ArrayLike, base: ArrayLike, episodes: Sequence[int], metric: Metric, units: Units) -> float:
+    """Return the p that holds at any look, over the means of units in their order."""
     data, kind, _ = _subtract(arm, base, metric)
     if kind == "length":
         return 1.0
-    order = list(dict.fromkeys(scenes))
-    groups = [data[[one == scene for one in scenes]] for scene in order]
-    return find_anytime_p([each.mean() for each in groups] if len(order) > 1 else data)
+    differences = dict(zip(episodes, data, strict=True))
+    groups = [[differences[index] for index in unit if index in differences] for unit in units]
+    return find_anytime_p([float(np.mean(group)) for group in groups if group])
 
 
 def _subtract(arm: ArrayLike, base: ArrayLike, metric: Metric) -> tuple[NDArray[np.float64], Kind, Interval]:
@@ -152,7 +154,7 @@ def compare(
     outcomes: Mapping[str, Mapping[int, Mapping[str, Any]]],
     metric: Metric,
     seed: int = 0,
-    anytime: bool = False,
+    units: Units | None = None,
 ) -> Difference | None:
     """Return the paired difference of two arms, or None without common episodes that have the metric.
 
@@ -162,8 +164,9 @@ def compare(
         outcomes: for each arm, scored episodes by index with "scene" and "metrics".
         metric: which metric.
         seed: of the bootstrap.
-        anytime: whether p must hold however often the run was looked at before it was stopped; of lengths it is then 1,
-            as the bets need bounds.
+        units: of a run that was looked at before it was stopped: the episodes of each unit, in order
+            (`wiw.analysis.stopping.find_units`). P then holds however often one looks; of lengths it is 1, as the bets
+            need bounds.
     """
     both = [
         index
@@ -184,8 +187,8 @@ def compare(
         int((gains > 0).sum()),
         int((gains < 0).sum()),
         compute_p_value(ours, theirs, scenes, metric, seed=seed)
-        if not anytime
-        else _compute_anytime_p(ours, theirs, scenes, metric),
+        if units is None
+        else _compute_anytime_p(ours, theirs, both, metric, units),
     )
 
 

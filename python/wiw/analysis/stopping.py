@@ -74,7 +74,7 @@ class StopRule:
             for row in outcomes
             if row["status"] == "done" and SUCCESS.name in row["metrics"]
         }
-        unit = "scene" if len({strip_edits(episode.scene) for episode in episodes}) > 1 else "episode"
+        unit = _name_unit(episodes)
         found = [self._look_at(target, order, scores, unit) for target in self.targets]
         return Look(bound, len(episodes), "; ".join(text for text, _ in found), all(reached for _, reached in found))
 
@@ -86,10 +86,14 @@ class StopRule:
         unit: str,
     ) -> tuple[str, bool]:
         values = list_unit_means(target, units, scores)
+        name = "-".join(target)
+        if not len(values):  # a rule of any width must not hold of nothing
+            return f"{name} unknown: no {unit} is complete so far", False
         low, high = find_percent_interval(target, values)
-        middle = 100 * float(values.mean()) if len(values) else 0.0
+        middle = 100 * float(values.mean())
         sign = "+" if len(target) == 2 else ""
-        text = f"{'-'.join(target)} {middle:{sign}.1f} [{low:.1f}, {high:.1f}] over {len(values)} {unit}s"
+        count = f"1 {unit}" if len(values) == 1 else f"{len(values)} {unit}s"
+        text = f"{name} {middle:{sign}.1f} [{low:.1f}, {high:.1f}] over {count}"
         if self.width is None:
             return text, low > 0 or high < 0
         return f"{text}, width {high - low:.1f}", high - low < self.width
@@ -113,6 +117,38 @@ def list_units(episodes: Sequence[Episode], bound: int) -> list[list[int]]:
         return [[index] for index in range(bound)]
     complete = [indices for indices in scenes.values() if indices[-1] < bound]
     return sorted(complete, key=lambda indices: indices[-1])
+
+
+def find_units(
+    episodes: Sequence[Episode], outcomes: Sequence[Mapping[str, Any]], arms: Sequence[str]
+) -> list[list[int]]:
+    """Return the units that a run can be judged by so far: those of the first episodes that have ended in all arms.
+
+    A scene in which episodes are still to run is no unit, as in the looks of the run itself.
+
+    Args:
+        episodes: all that the run may have.
+        outcomes: with "arm" and "episode", however they ended.
+        arms: which must have ended.
+    """
+    ended: dict[str, set[int]] = {arm: set() for arm in arms}
+    for row in outcomes:
+        if row["arm"] in ended:
+            ended[row["arm"]].add(row["episode"])
+    bound = next((i for i in range(len(episodes)) if any(i not in own for own in ended.values())), len(episodes))
+    return list_units(episodes, bound)
+
+
+def describe_bets(episodes: Sequence[Episode], units: Sequence[Sequence[int]]) -> str:
+    """Return the test over these units in words."""
+    if _name_unit(episodes) == "episode":
+        return "a betting test over episodes of one scene, which says nothing about other scenes"
+    done = "1 is" if len(units) == 1 else f"{len(units)} are"
+    return f"a betting test over scenes ({done} complete)"
+
+
+def _name_unit(episodes: Sequence[Episode]) -> str:
+    return "scene" if len({strip_edits(episode.scene) for episode in episodes}) > 1 else "episode"
 
 
 def list_unit_means(

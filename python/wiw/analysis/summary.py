@@ -25,7 +25,8 @@ from wiw.analysis.breakdowns import (
 from wiw.analysis.flip_test import FEWEST_SCENES
 from wiw.analysis.marks import BLIND, Marks, answer_blind, read_marks
 from wiw.analysis.noise_floor import NoiseFloor, find_repeats, measure_noise
-from wiw.analysis.statistics import LEVEL, Difference, Estimate, adjust_p_values, compare, estimate_mean
+from wiw.analysis.statistics import LEVEL, Difference, Estimate, Units, adjust_p_values, compare, estimate_mean
+from wiw.analysis.stopping import describe_bets, find_units
 from wiw.analysis.utility import CEILING, FLOOR, Utility, utility
 from wiw.errors import RegistryError
 from wiw.metrics.metric import ANSWER_SCORE, SPL, SPL_RULE, SUCCESS, Metric
@@ -141,6 +142,8 @@ class Summary:
     """Answers of a language model by arm and by the kind of problem for which they could not be used ("": none)."""
     looks: str = field(default="", kw_only=True)
     """Sentences on the rule by which the run was to stop early, and on whether it did; empty without one."""
+    bets: str = field(default="", kw_only=True)
+    """The test behind the p values of a run with such a rule, in words; empty without one."""
     noise: tuple[NoiseFloor, ...] = field(default=(), kw_only=True)
     """How much each arm that repeats another differs from that one."""
     departures: tuple[Departure, ...] = field(default=(), kw_only=True)
@@ -239,7 +242,7 @@ def summarise(
     twins: Sequence[tuple[int, int]] = (),
     judge: JudgeRecord | None = None,
     pairs: Sequence[tuple[str, str]] | None = None,
-    anytime: bool = False,
+    units: Units | None = None,
 ) -> Summary:
     """Return the numbers of a run.
 
@@ -253,7 +256,8 @@ def summarise(
         twins: pairs of episodes that are twins.
         judge: whose marks the outcomes have, where answers are judged.
         pairs: arms whose anytime curves are compared, each with its base; None for each arm with "none" and "copy".
-        anytime: whether the run was looked at before it was stopped, so that p must allow for that.
+        units: of a run that was looked at before it was stopped, so that p must allow for that
+            (`wiw.analysis.stopping.find_units`).
     """
     done, errors = split_outcomes(arms, outcomes)
     roles = {arm: role_of(arm, None if agents is None else agents[arm]) for arm in arms}
@@ -262,7 +266,7 @@ def summarise(
         difference
         for base in ("none", FLOOR)
         if base in arms
-        for difference in _compare_with(base, arms, done, seed, anytime)
+        for difference in _compare_with(base, arms, done, seed, units)
     )
     same = len({frozenset(ended) for ended in done.values()}) == 1
     blind = answer_blind(done, tables.cuts) if BLIND not in done else {}
@@ -271,7 +275,7 @@ def summarise(
     beside = {**done, BLIND: blind} if blind else done
     if pairs is None:
         pairs = [(arm, base) for base in ("none", FLOOR) if base in arms for arm in arms if arm not in (base, "none")]
-    breakdowns = _break_down(beside, pairs, tables, twins, marks, seed, anytime)
+    breakdowns = _break_down(beside, pairs, tables, twins, marks, seed, units)
     return Summary(lines, differences, same, _list_utilities(lines, done), breakdowns, baselines, marks)
 
 
@@ -280,6 +284,7 @@ def summarise_run(run: Run) -> Summary:
     config = run.store.config
     agents = {arm["name"]: arm["agent"] for arm in config["arms"]}
     episodes, outcomes = run.store.episodes(), run.store.outcomes()
+    units = find_units(episodes, outcomes, run.arms) if "until" in run.store.info else None
     found = summarise(
         run.arms,
         outcomes,
@@ -289,9 +294,9 @@ def summarise_run(run: Run) -> Summary:
         tables=run.tables,
         twins=find_twins(episodes),
         judge=run.store.judge,
-        anytime="until" in run.store.info,
+        units=units,
     )
-    tiers = _summarise_tiers(run, outcomes, agents)
+    tiers = _summarise_tiers(run, outcomes, agents, units)
     answers = run.store.count_answers()
     return replace(
         found,
@@ -300,6 +305,7 @@ def summarise_run(run: Run) -> Summary:
         answers={arm: answers[arm] for arm in run.arms if arm in answers},
         departures=read_departures(run.store.info),
         looks=_describe_looks(run.store.info),
+        bets="" if units is None else describe_bets(episodes, units),
         noise=_measure_noise(run, outcomes),
         tiers=tiers,
     )
@@ -342,13 +348,13 @@ def _describe_looks(info: Mapping[str, Any]) -> str:
     rule = f"The run was checked every {info['until']['every']} episodes, to stop once {info['until']['rule']}."
     ended = f"It stopped at {info['stopped']['why']}." if "stopped" in info else "It has not been stopped so far."
     return (
-        f"{rule} {ended} That interval is from a confidence sequence, and p from a betting test over scenes: both are "
+        f"{rule} {ended} That interval is from a confidence sequence, and p from a betting test: both are "
         "valid at any time. The intervals in the tables are for a number of episodes that is fixed in advance."
     )
 
 
 def _summarise_tiers(
-    run: Run, outcomes: Sequence[Mapping[str, Any]], agents: Mapping[str, Mapping[str, Any]]
+    run: Run, outcomes: Sequence[Mapping[str, Any]], agents: Mapping[str, Mapping[str, Any]], units: Units | None
 ) -> dict[str, Summary]:
     """Return the numbers of each tier of episodes; nothing if there is one tier, or none."""
     episodes = run.store.episodes()
@@ -363,7 +369,7 @@ def _summarise_tiers(
             run.store.config["seed"],
             agents,
             tables=run.tables,
-            anytime="until" in run.store.info,
+            units=units,
         )
         for tier in (tiers if len(tiers) > 1 else ())
     }
@@ -463,10 +469,10 @@ def _read_role(arm: str) -> str:
 
 
 def _compare_with(
-    base: str, arms: Sequence[str], done: Mapping[str, Mapping[int, Mapping[str, Any]]], seed: int, anytime: bool
+    base: str, arms: Sequence[str], done: Mapping[str, Mapping[int, Mapping[str, Any]]], seed: int, units: Units | None
 ) -> tuple[Difference, ...]:
     others = [arm for arm in arms if arm not in (base, "none")]
-    found = [compare(arm, base, done, metric, seed, anytime) for arm in others for metric in select_metrics(done)]
+    found = [compare(arm, base, done, metric, seed, units) for arm in others for metric in select_metrics(done)]
     return adjust_p_values([difference for difference in found if difference is not None])
 
 
@@ -487,12 +493,12 @@ def _break_down(
     twins: Sequence[tuple[int, int]],
     marks: Marks | None,
     seed: int,
-    anytime: bool,
+    units: Units | None,
 ) -> tuple[Breakdown, ...]:
     known = {metric.name: _label(metric, marks) for metric in load_metrics()}
     return (
         *split_by_kind(done, [known[name] for name in tables.kinds if name in known], tables.kind, seed),
-        *_cut_episodes(done, pairs, tables, marks, seed, anytime),
+        *_cut_episodes(done, pairs, tables, marks, seed, units),
         *score_twins(done, twins, seed),
     )
 
@@ -503,7 +509,7 @@ def _cut_episodes(
     tables: TableSpec,
     marks: Marks | None,
     seed: int,
-    anytime: bool,
+    units: Units | None,
 ) -> tuple[Breakdown, ...]:
     """Return the anytime curve, over primitives where the task names cuts, else over decisions, and its differences."""
     if tables.cuts:
@@ -512,7 +518,7 @@ def _cut_episodes(
         done, cuts = cut_by_decisions(done)
     if cuts is None:
         return ()
-    return (*read_anytime_curve(done, cuts, seed), *compare_anytime_curves(done, pairs, cuts, seed, anytime))
+    return (*read_anytime_curve(done, cuts, seed), *compare_anytime_curves(done, pairs, cuts, seed, units))
 
 
 def _label(metric: Metric, marks: Marks | None) -> Metric:
@@ -649,8 +655,8 @@ def _explain_differences(summary: Summary) -> list[str]:
     if first is None:
         return []
     what = "exact sign-flip test over scenes"
-    if summary.looks:
-        what = "a betting test over scenes, valid at any time; none for lengths"
+    if summary.bets:
+        what = f"{summary.bets}, valid at any time; none for lengths"
     elif first.scenes == 1:
         what = "exact sign-flip test over episodes; it says nothing about other scenes"
     elif first.scenes < FEWEST_SCENES:

@@ -125,6 +125,7 @@ def require_equal_manifests(stores: Sequence[RunStore]) -> None:
                 f"{first.path.parent} and {other.path.parent} are not from the same run: {place}: {_show(here)} and "
                 f"{_show(there)}; expected stores of one command that differ only in --shard"
             )
+    _require_one_stop(stores)
     known: dict[str, tuple[Path, Any]] = {}  # by arm: a store has built the agents of those that it has begun
     for store in stores:
         for arm, agent in store.info.get("built", {}).items():
@@ -136,11 +137,24 @@ def require_equal_manifests(stores: Sequence[RunStore]) -> None:
                 )
 
 
+def _require_one_stop(stores: Sequence[RunStore]) -> None:
+    """Check that all stores that a rule has stopped were stopped at the same look; others may not have got there."""
+    stopped = [store for store in stores if "stopped" in store.info]
+    for other in stopped[1:]:
+        here, there = stopped[0].info["stopped"], other.info["stopped"]
+        if here != there:
+            raise StoreError(
+                f"{stopped[0].path.parent} and {other.path.parent} are of one run (--until) but stopped at different "
+                f"looks: {here['why']}; and {there['why']}. Expected the same stop; find out which is right with "
+                "`wiw verify`, and merge without the other"
+            )
+
+
 def _read_manifest(store: RunStore) -> dict[str, Any]:
     info = store.info
     episodes = [{**asdict(episode), "geodesic": None} for episode in store.episodes()]  # may be measured in one alone
     limits = {name: info["limits"].get(name) for name in ("fidelity", "fidelity_share", "lpips")}
-    kept = {name: info.get(name) for name in ("sources", "scenes")}
+    kept = {name: info.get(name) for name in ("sources", "scenes", "until")}
     versions = {"wiw": store.wiw_version, "benchmark": store.benchmark}
     return {**versions, **store.config, "salt": store.salt, **limits, **kept, "episode": episodes}
 
@@ -223,6 +237,7 @@ def _merge_info(parts: Sequence[RunStore]) -> dict[str, Any]:
     named = ("shard", "platform", "command", "preparation_seconds", "session")
     info = {name: value for name, value in infos[0].items() if name not in ("shard", "session")}
     info["built"] = {arm: agent for own in reversed(infos) for arm, agent in own.get("built", {}).items()}
+    info |= next(({"stopped": own["stopped"]} for own in infos if "stopped" in own), {})
     info["benchmark"] = parts[0].benchmark
     info["preparation_seconds"] = sum(own.get("preparation_seconds", 0.0) for own in infos)
     info["merged"] = [

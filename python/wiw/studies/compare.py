@@ -12,6 +12,7 @@ from typing import Any
 from wiw.analysis.breakdowns import find_twins
 from wiw.analysis.statistics import adjust_p_values
 from wiw.analysis.statistics import compare as compare_arms
+from wiw.analysis.stopping import describe_bets, find_units
 from wiw.analysis.summary import (
     ArmSummary,
     Group,
@@ -110,7 +111,8 @@ def compare(
     labelled = [tuple(labels[arm] for arm, (_, labels) in zip(pair, sides, strict=True)) for pair in pairs]
     seed = int(first.store.config["seed"])
     episodes = first.store.episodes()
-    anytime = any("until" in log.store.info for log in (first, second))
+    looked_at = any("until" in log.store.info for log in (first, second))
+    units = find_units(episodes, outcomes, [label for pair in labelled for label in pair]) if looked_at else None
     both = summarise(
         [label for pair in labelled for label in pair],
         outcomes,
@@ -120,11 +122,11 @@ def compare(
         twins=find_twins(episodes),
         judge=first.store.judge,
         pairs=[(theirs, ours) for ours, theirs in labelled],
-        anytime=anytime,
+        units=units,
     )
     done, _ = split_outcomes([line.name for line in both.arms], outcomes)
     found = [
-        compare_arms(theirs, ours, done, metric, seed, anytime)
+        compare_arms(theirs, ours, done, metric, seed, units)
         for ours, theirs in labelled
         for metric in select_metrics(done)
     ]
@@ -141,6 +143,7 @@ def compare(
         (*unlike, *(line for pair in pairs for line in _describe_changes(first, second, pair))),
         unbalanced=count_unbalanced(second),
         looks=_describe_looks(first, second, names),
+        bets="" if units is None else describe_bets(episodes, units),
     )
 
 

@@ -15,6 +15,7 @@ from wiw.analysis.costs import costs
 from wiw.analysis.quality import QualityTable
 from wiw.analysis.statistics import Difference, adjust_p_values
 from wiw.analysis.statistics import compare as compare_arms
+from wiw.analysis.stopping import find_units
 from wiw.analysis.summary import select_metrics, split_outcomes
 from wiw.errors import ArgumentError
 from wiw.files import atomic_file
@@ -173,9 +174,10 @@ def _adjust(parts: Sequence[StudyPart]) -> tuple[StudyPart, ...]:
 def _compare(run: StudyRun, log: RunLog) -> tuple[Difference, ...]:
     """Return the differences of one run's pairs; p-values hold at any look, where the run is looked at early."""
     done, _ = split_outcomes(log.arms, log.store.outcomes())
-    seed, anytime = log.store.config["seed"], "until" in log.store.info
+    seed, looked_at = log.store.config["seed"], "until" in log.store.info
+    units = find_units(log.store.episodes(), log.store.outcomes(), log.arms) if looked_at else None
     found = [
-        compare_arms(arm, base, done, metric, seed, anytime)
+        compare_arms(arm, base, done, metric, seed, units)
         for arm, base in run.compare
         for metric in select_metrics(done)
     ]

@@ -3,6 +3,7 @@
 
 import math
 import sqlite3
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -134,6 +135,82 @@ def test_a_look_names_what_it_counts(scenes, said):
         "4 of 4 episodes: none 100.0"
     )
     assert said in parse_stop_rule("width<8", ["none"], 4).look(4, episodes, rows).text
+
+
+def list_scenes(scenes):
+    return [Episode("", scene, (0.0, 0.0, 0.0), 0.0, (0.0, 0.0, 0.0), 0.0, 1.0) for scene in scenes]
+
+
+@pytest.mark.parametrize(
+    ("bound", "said"),
+    [
+        (3, "oracle-none unknown: no scene is complete so far"),
+        (4, "oracle-none +100.0 [-"),
+        (8, "over 2 scenes"),
+    ],
+)
+@pytest.mark.parametrize("rule", ["oracle-none excludes 0", "width(oracle-none)<300"])
+def test_a_look_before_scenes_are_complete_says_so(bound, said, rule):
+    """Of a run of several scenes, the episodes of the first one do not count as units."""
+    rows = [
+        {"arm": arm, "episode": i, "status": "done", "metrics": {"success": float(arm == "oracle")}}
+        for arm in ("none", "oracle")
+        for i in range(bound)
+    ]
+    look = parse_stop_rule(rule, ["none", "oracle"], 4).look(bound, list_scenes(["a"] * 4 + ["b"] * 4), rows)
+    assert said in look.text and ("over 1 scene, " in f"{look.text}, ") == (bound == 4)
+    assert look.is_enough == (bound > 3 and rule.startswith("width"))
+
+
+class FewScenes(LineTask):
+    """Twenty episodes in each scene."""
+
+    def episodes(self, count):
+        return [replace(one, scene=f"line/{i // 20}") for i, one in enumerate(super().episodes(count))]
+
+
+def test_p_is_over_complete_scenes_however_many_have_ended(tmp_path):
+    """Twenty of twenty episodes of a single scene say next to nothing about other scenes; nor does a part of one."""
+    agents = {"none": LineAgent(0.0), "oracle": LineAgent(1.0)}
+    log = run_arms(FewScenes(), agents, 60, out=tmp_path, until="width<1", look_every=30, progress=False)
+    whole = log.numbers().difference("oracle", "none")
+    rows = {(row["arm"], row["episode"]): row["metrics"]["success"] for row in log.episodes}
+    assert whole.p_value == pytest.approx(find_anytime_p(average(rows, 3)))
+    for ended, scenes in ((45, 2), (39, 1), (20, 1), (19, 0)):
+        with sqlite3.connect(tmp_path / "run.sqlite") as store:
+            store.execute("DELETE FROM outcome WHERE episode >= ? AND arm = 'none'", (ended,))
+        numbers = load_run(tmp_path).numbers()
+        found = numbers.difference("oracle", "none")
+        assert found.estimate.n == ended
+        assert found.p_value == pytest.approx(find_anytime_p(average(rows, scenes))) and not found.is_shown
+        text = " ".join(str(numbers).split())
+        assert f"a betting test over scenes ({scenes} {'is' if scenes == 1 else 'are'} complete), valid at any" in text
+    assert find_anytime_p(np.ones(19)) < 0.001, "as episodes they would seem to show it"
+
+
+def average(rows, scenes):
+    return [
+        np.mean([rows["oracle", i] - rows["none", i] for i in range(20 * scene, 20 * scene + 20)])
+        for scene in range(scenes)
+    ]
+
+
+class OneScene(LineTask):
+    """All episodes in one scene."""
+
+    def episodes(self, count):
+        return [replace(one, scene="line") for one in super().episodes(count)]
+
+
+def test_in_a_run_of_one_scene_bets_are_on_episodes_and_the_notes_say_so(tmp_path):
+    agents = {"none": LineAgent(0.0), "oracle": LineAgent(1.0)}
+    log = run_arms(OneScene(), agents, 20, out=tmp_path, until="width<1", look_every=30, progress=False)
+    numbers, rows = log.numbers(), {(row["arm"], row["episode"]): row["metrics"]["success"] for row in log.episodes}
+    differences = [rows["oracle", i] - rows["none", i] for i in range(20)]
+    assert numbers.difference("oracle", "none").p_value == pytest.approx(find_anytime_p(differences))
+    text = " ".join(str(numbers).split())
+    assert "a betting test over episodes of one scene, which says nothing about other scenes, valid at any time" in text
+    assert "a betting test over scenes" not in text
 
 
 AGENTS = {"none": LineAgent(0.2), "oracle": LineAgent(1.0)}

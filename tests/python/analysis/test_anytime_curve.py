@@ -101,6 +101,6 @@ def test_a_run_that_was_looked_at_has_bold_differences_by_the_betting_test() -> 
         for i in range(20)
     ]
     for anytime in (False, True):
-        found = summarise(["none", "oracle"], outcomes, 20, anytime=anytime)
+        found = summarise(["none", "oracle"], outcomes, 20, units=[[i] for i in range(20)] if anytime else None)
         (gain,) = [each for each in found.breakdowns if each.name == "anytime_differences"]
         assert found.difference("oracle", "none").is_shown == bool(gain.shown) == (not anytime)

@@ -199,6 +199,35 @@ def test_unlike_agents_are_refused_though_the_first_store_has_not_begun_that_arm
         wiw.merge(parts, tmp_path / "again")
 
 
+def test_stores_with_different_rules_for_stopping_are_refused(tmp_path):
+    rules = {"a": "width<80", "b": "width<70", "c": None}
+    for name, until in rules.items():
+        begin(tmp_path / name, until=until).close()
+    for other, named in (("b", r'until\.rule: "width<80" and "width<70"'), ("c", r"until: \{.*\} and null")):
+        with pytest.raises(StoreError, match=f"not from the same run: {named}"):
+            wiw.merge([tmp_path / "a", tmp_path / other], tmp_path / "merged")
+    assert not (tmp_path / "merged").exists()
+
+
+def test_a_merged_run_was_stopped_where_its_parts_were(tmp_path):
+    """A copy from before the stop does not hide it; stores that stopped at different looks are not of one run."""
+    for name in ("before", "after"):
+        begin(tmp_path / name, 40, until="width<80", look_every=4).close()
+    stopped = load_run(tmp_path / "after").store.info["stopped"]
+    last = stopped["episodes"] - 1
+    assert last < 39
+    edit(tmp_path / "before", f"DELETE FROM outcome WHERE episode = {last}")
+    edit(tmp_path / "before", "UPDATE run SET info = json_remove(info, '$.stopped')")
+    merged = wiw.merge([tmp_path / "before", tmp_path / "after"], tmp_path / "merged")
+    assert load_run(tmp_path / "merged").store.info["stopped"] == stopped and merged.complete
+    edit(
+        tmp_path / "before",
+        'UPDATE run SET info = json_set(info, \'$.stopped\', json(\'{"episodes": 4, "why": "x"}\'))',
+    )
+    with pytest.raises(StoreError, match=r"before and .*after are of one run .* different looks: x; and"):
+        wiw.merge([tmp_path / "before", tmp_path / "after"], tmp_path / "again")
+
+
 def test_a_merge_of_nothing_is_refused(tmp_path, capsys):
     assert main(["merge", "--out", str(tmp_path / "merged")]) == 2
     assert "expected at least one run" in capsys.readouterr().err and not (tmp_path / "merged").exists()
