@@ -45,9 +45,20 @@ class Power:
     scenes: int
     """Number of scenes needed."""
     by_interval: float
-    """Chance, in simulated runs, that the 95 % interval of the difference excludes 0 on the right side."""
+    """Chance, in simulated runs, that the interval of the difference at `confidence` excludes 0 on the right side."""
     by_test: float
-    """The same for the test behind the p values in tables (`wiw.analysis.flip_test`)."""
+    """The same for the test behind the p values in tables (`wiw.analysis.flip_test`), at the same level."""
+
+    @property
+    def confidence(self) -> float:
+        """Confidence of the interval in percent: 95 for one arm, more for one of several, adjusted by Bonferroni."""
+        return 100 * _find_confidence(self.arms)
+
+    @property
+    def interval(self) -> str:
+        """The interval in words, e.g. "98.75 % interval, adjusted for 4 arms"."""
+        adjusted = f", adjusted for {self.arms} arms" if self.arms > 1 else ""
+        return f"{self.confidence:.4g} % interval{adjusted}"
 
     @property
     def episodes(self) -> int:
@@ -69,7 +80,7 @@ class Power:
         return (
             f"{self.episodes} episodes in {self.scenes} scenes ({self.per_scene} each) show a difference of "
             f"{self.difference:+g} points to {self.base:g} %{among} with a chance of {100 * self.by_interval:.0f} % by "
-            f"its interval and {100 * self.by_test:.0f} % by the test, if {self.won:g} % of episodes are won, "
+            f"its {self.interval}, and {100 * self.by_test:.0f} % by the test, if {self.won:g} % of episodes are won, "
             f"{self.lost:g} % are lost, and episodes of a scene correlate by {self.correlation:g}."
         )
 
@@ -119,7 +130,7 @@ def power(
             "power: expected either a difference (to compute the scenes it needs) or a number of scenes (to compute "
             "what they can show)"
         )
-    plan = _Plan(losses, correlation, per_scene, chance, 1 - 0.05 / arms if arms > 0 else 0.0, seed)
+    plan = _Plan(losses, correlation, per_scene, chance, _find_confidence(arms), seed)
     if difference is not None:
         _check(difference, base, losses, correlation, per_scene, chance, arms)
         needed, shares = plan.scenes_for(abs(difference))
@@ -131,6 +142,11 @@ def power(
         difference, shares = plan.difference_for(scenes, 100 - base - losses)
         needed = scenes
     return Power(difference, base, losses, correlation, per_scene, arms, chance, needed, *shares)
+
+
+def _find_confidence(arms: int) -> float:
+    """Return the confidence of the strictest step of Holm's adjustment for so many arms."""
+    return 1 - 0.05 / arms if arms > 0 else 0.0
 
 
 @dataclass(frozen=True)

@@ -6,6 +6,7 @@ from __future__ import annotations
 import math
 import sys
 import warnings
+from collections import Counter
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cache, reduce
@@ -67,7 +68,9 @@ SPAN = (CEILING, FLOOR, SUCCESS.name)
 """Arm, base and metric of the difference that utility is a share of."""
 
 MAX_ERROR_SHARE = 0.01
-"""Largest share of an arm's episodes that may end with an infrastructure error in a valid run."""
+"""Largest share of an arm's ended episodes that may have ended with an infrastructure error in a valid run."""
+LONGEST_CAUSE = 200
+"""Characters of an error's message that notes show."""
 
 
 @dataclass(frozen=True)
@@ -84,11 +87,18 @@ class ArmSummary:
     """Episodes not run yet."""
     estimates: Mapping[str, Estimate]
     """Over the scored episodes, by metric: "success" and "spl" in percent, "actions" in primitives."""
+    cause: str = ""
+    """Most frequent message of the errors, with how many had it, e.g. "2 of 3: OSError: gone"; empty without errors."""
 
     @property
     def total(self) -> int:
         """Episodes of the run, scored or not."""
         return self.done + self.errors + self.pending
+
+    @property
+    def ended(self) -> int:
+        """Episodes that have ended, scored or with an error."""
+        return self.done + self.errors
 
     @property
     def scored_of_total(self) -> str:
@@ -146,6 +156,8 @@ class Summary:
     """The test behind the p values of a run with such a rule, in words; empty without one."""
     noise: tuple[NoiseFloor, ...] = field(default=(), kw_only=True)
     """How much each arm that repeats another differs from that one."""
+    part: str = field(default="", kw_only=True)
+    """Sentence on the part of a run that a shard is; empty for a whole run."""
     departures: tuple[Departure, ...] = field(default=(), kw_only=True)
     """Where the run departs from the paper's protocol."""
     tiers: Mapping[str, Summary] = field(default_factory=dict, kw_only=True)
@@ -210,10 +222,10 @@ class Summary:
     def invalid(self) -> tuple[str, ...]:
         """Reasons why the run must not be reported, a sentence per arm; empty for a valid run."""
         return tuple(
-            f"{line.errors} of {line.total} episodes of {line.name} ended with an infrastructure error "
-            f"({100 * line.errors / line.total:.1f} %, more than {100 * MAX_ERROR_SHARE:g} %)."
+            f"{line.errors} of {line.ended} episodes of {line.name} ended with an infrastructure error "
+            f"({100 * line.errors / line.ended:.1f} %, more than {100 * MAX_ERROR_SHARE:g} %)."
             for line in self.arms
-            if line.errors > MAX_ERROR_SHARE * line.total
+            if line.errors > MAX_ERROR_SHARE * line.ended
         )
 
     def __getitem__(self, arm: str) -> ArmSummary:
@@ -261,7 +273,12 @@ def summarise(
     """
     done, errors = split_outcomes(arms, outcomes)
     roles = {arm: role_of(arm, None if agents is None else agents[arm]) for arm in arms}
-    lines = tuple(_summarise_arm(arm, roles[arm], done[arm], errors[arm], episodes, seed) for arm in arms)
+    lines = tuple(
+        replace(
+            _summarise_arm(arm, roles[arm], done[arm], errors[arm], episodes, seed), cause=find_cause(arm, outcomes)
+        )
+        for arm in arms
+    )
     differences = tuple(
         difference
         for base in ("none", FLOOR)
@@ -288,7 +305,7 @@ def summarise_run(run: Run) -> Summary:
     found = summarise(
         run.arms,
         outcomes,
-        len(run.store.own_episodes()) if "stopped" in run.store.info else len(episodes),
+        len(run.store.own_episodes()),
         config["seed"],
         agents,
         tables=run.tables,
@@ -308,7 +325,16 @@ def summarise_run(run: Run) -> Summary:
         bets="" if units is None else describe_bets(episodes, units),
         noise=_measure_noise(run, outcomes),
         tiers=tiers,
+        part=_describe_shard(run),
     )
+
+
+def _describe_shard(run: Run) -> str:
+    """Return which part of a run a shard is; empty for a whole run."""
+    if run.store.shard is None:
+        return ""
+    own, whole = len(run.store.own_episodes()), len(run.store.episodes())
+    return f"Shard {run.store.shard}: {own} of the run's {whole} episodes; `wiw merge` joins all shards."
 
 
 def _measure_noise(run: Run, outcomes: Sequence[Mapping[str, Any]]) -> tuple[NoiseFloor, ...]:
@@ -358,7 +384,7 @@ def _summarise_tiers(
 ) -> dict[str, Summary]:
     """Return the numbers of each tier of episodes; nothing if there is one tier, or none."""
     episodes = run.store.episodes()
-    own = run.store.own_episodes() if "stopped" in run.store.info else range(len(episodes))
+    own = run.store.own_episodes()
     tiers = dict.fromkeys(episodes[index].tier for index in own)
     indices = {tier: {index for index in own if episodes[index].tier == tier} for tier in tiers}
     return {
@@ -441,6 +467,18 @@ def split_outcomes(
         else:
             errors[outcome["arm"]] += 1
     return done, errors
+
+
+def find_cause(arm: str, outcomes: Sequence[Mapping[str, Any]]) -> str:
+    """Return the most frequent last line of an arm's errors, the first of several, and how many errors have it."""
+    errors = [row.get("error", "") for row in outcomes if row["arm"] == arm and row["status"] == "error"]
+    messages = [error.strip().splitlines()[-1].strip() if error.strip() else "no message" for error in errors]
+    if not messages:
+        return ""
+    message, count = Counter(messages).most_common(1)[0]
+    short = message if len(message) <= LONGEST_CAUSE else f"{message[: LONGEST_CAUSE - 1]}…"
+    shown = "".join(sign if sign.isprintable() else "�" for sign in short)
+    return f"{count} of {len(messages)}: {shown}"
 
 
 def role_of(arm: str, agent: Mapping[str, Any] | None = None) -> str:
@@ -585,7 +623,7 @@ def notes(summary: Summary) -> list[str]:
     found += [SPL_RULE] if summary.marks is None and SPL.name in {each.name for each in list_columns(summary)} else []
     found += [_explain_paper_name(metric) for metric in list_columns(summary) if metric.paper_name]
     found += [_describe_noise(one) for one in summary.noise]
-    found += [summary.looks] if summary.looks else []
+    found += [text for text in (summary.looks, summary.part) if text]
     found += summary.remarks()
     widest = max(
         (line.estimates["success"] for line in summary.arms if "success" in line.estimates),
@@ -615,6 +653,7 @@ def _describe_missing(line: ArmSummary) -> str:
         count = "1 infrastructure error is" if line.errors == 1 else f"{line.errors} infrastructure errors are"
         text += f"; {count} excluded from scores"
     text += f"; {line.pending} still to run" if line.pending else ""
+    text += f". Most frequent error, {line.cause}" if line.cause else ""
     if "success" not in line.estimates:
         return f"{text}."
     won = line.estimates["success"].value * line.done

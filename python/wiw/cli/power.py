@@ -133,7 +133,7 @@ def _print_table(plans: Sequence[Power], chance: float, tasks: Sequence[str] = (
     from rich.table import Table
 
     table = Table(
-        title=f"Needed to show a difference with a chance of {100 * chance:g} %",
+        title=f"Needed to show a difference with a chance of {100 * chance:g} % ({plans[0].interval})",
         title_justify="left",
         box=box.SIMPLE_HEAD,
     )

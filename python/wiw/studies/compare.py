@@ -158,8 +158,6 @@ def _summarise_arms(log: RunLog, both: Summary, labels: Mapping[str, str]) -> li
     """Return the lines of one run's arms, with their roles in it and what it still has to run; `labels` by arm."""
     agents = {one["name"]: one["agent"] for one in log.store.config["arms"]}
     lines = [replace(both[label], role=role_of(arm, agents[arm])) for arm, label in labels.items()]
-    if "stopped" not in log.store.info:
-        return lines
     episodes = len(log.store.own_episodes())
     return [replace(line, pending=episodes - line.done - line.errors) for line in lines]
 

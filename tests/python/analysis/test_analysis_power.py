@@ -173,3 +173,14 @@ def test_two_models_five_points_apart_on_each_task(capsys):
     assert main(["power", "5", "--task", "imagenav"]) == 0
     shown = capsys.readouterr().out
     assert str(wiw.power(5, **PILOTS["imagenav"].settings())) in shown
+
+
+@pytest.mark.parametrize(
+    ("arms", "said"), [(1, "its 95 % interval, and"), (4, "its 98.75 % interval, adjusted for 4 arms, and")]
+)
+def test_the_interval_is_named_by_its_confidence(arms, said, capsys):
+    """That of one of four arms excludes 0 where its p, times four, is at most 0.05."""
+    plan = wiw.power(20, arms=arms)
+    assert said in str(plan) and plan.confidence == pytest.approx(100 - 5 / arms)
+    assert main(["power", "--arms", str(arms)]) == 0
+    assert said.removeprefix("its ").removesuffix(", and") in " ".join(capsys.readouterr().out.split())

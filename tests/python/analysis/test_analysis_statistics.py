@@ -244,6 +244,28 @@ def test_a_run_is_invalid_where_over_one_percent_of_an_arm_are_errors(errors, in
     assert any("INVALID RUN" in note and "3 of 200" in note for note in notes(summary)) == invalid
 
 
+@pytest.mark.parametrize(("errors", "invalid"), [(0, False), (1, True)])
+def test_episodes_still_to_run_do_not_hide_a_share_of_errors(errors, invalid):
+    """One of 20 that have ended is 5 %, however many hundred are still to run."""
+    outcomes = [outcome("warp", i, 1.0, status="error" if i < errors else "done") for i in range(20)]
+    summary = summarise(["warp"], outcomes, episodes=400)
+    assert bool(summary.invalid) == invalid and summary["warp"].pending == 380
+    assert any("1 of 20 episodes of warp" in reason and "5.0 %" in reason for reason in summary.invalid) == invalid
+
+
+def test_the_most_frequent_error_of_each_arm_is_told():
+    causes = ["Traceback\n  File x\nOSError: gone", "ValueError: odd", "Traceback\nValueError: odd\n"]
+    outcomes = [{**outcome("warp", i, 0.0, status="error"), "error": cause} for i, cause in enumerate(causes)]
+    outcomes += [{**outcome("oracle", 0, 0.0, status="error"), "error": f"\x1b[31m{'x' * 500}"}]
+    outcomes += [outcome("none", i, 1.0) for i in range(3)] + [outcome("oracle", i, 1.0) for i in (1, 2)]
+    summary = summarise(["none", "warp", "oracle"], outcomes, 3)
+    assert (summary["none"].cause, summary["warp"].cause) == ("", "2 of 3: ValueError: odd")
+    assert summary["oracle"].cause.startswith("1 of 1: \ufffd[31mxxx") and len(summary["oracle"].cause) < 220
+    text = " ".join(shown(SummaryTable.of(summary)).split())
+    assert "Most frequent error, 2 of 3: ValueError: odd" in text and text.count("Most frequent error") == 2
+    assert "Most frequent error, 2 of 3: ValueError: odd" in summary_html(SummaryTable.of(summary))
+
+
 def test_differences_are_paired_by_episode_and_signed_towards_the_better():
     done = {
         "a": {i: outcome("a", i, 1.0, actions=20.0) for i in (0, 1, 2)},

@@ -25,6 +25,7 @@ from wiw.runs.rows import to_json
 from wiw.runs.store import RunStore
 from wiw.runs.store_file import store_path
 from wiw.studies.evaluate import evaluate, resume_run
+from wiw.studies.run_log import load_run
 
 TASK = f"{PYTHON_TESTS / 'fakes.py'}:line_task"
 
@@ -59,6 +60,30 @@ def test_shards_episodes_errors_and_shards_without_a_store(tmp_path, capsys):
     assert "no store yet: shards 2/3" in shown and "67 %" in shown and "4/6" in shown
     with pytest.raises(StoreError, match="no run at"):
         wiw.status(tmp_path / "nothing")
+
+
+def test_a_finished_shard_has_nothing_to_run_and_is_judged_by_its_own_episodes(tmp_path):
+    begin(tmp_path / "1", shard="1/3", scenes="broken")
+    log = load_run(tmp_path / "1")
+    (line,) = log.numbers().arms
+    assert (line.done, line.errors, line.pending, line.total) == (1, 1, 0, 2) and log.complete
+    assert ["1 of 2 episodes of none" in reason for reason in log.numbers().invalid] == [True]
+    shown = " ".join(str(log.numbers()).split())
+    assert "Shard 1/3: 2 of the run's 6 episodes" in shown and "still to run" not in shown
+    assert "Most frequent error, 1 of 1: " in shown and "no such scene" in shown
+    report = " ".join(log.report(tmp_path / "x.html").read_text().split())
+    assert "Most frequent error, 1 of 1: " in report and "Shard 1/3" in report
+
+
+def test_a_run_that_a_rule_has_stopped_is_done(tmp_path):
+    evaluate(
+        TaskRecipe(TASK), AgentRecipe("heuristic"), 60, out=tmp_path, until="width<80", look_every=4, progress=False
+    )
+    found, log = wiw.status(tmp_path), load_run(tmp_path)
+    assert found.total == found.ended == log.store.info["stopped"]["episodes"] < 60
+    (store,) = found.stores
+    assert (store.state, found.seconds_left) == ("done", 0.0)
+    assert [line.pending for line in log.numbers().arms] == [0] and "still to run" not in str(log.numbers())
 
 
 def test_runs_that_share_a_folder_are_added_up(tmp_path, capsys):
