@@ -479,7 +479,8 @@ class Exchange:
     """Every completion: `call` (the digest of its question), `text`, `finish`, `logprobs`, `prompt_tokens`,
     `completion_tokens`. They suffice to replay a run without the model."""
     result: Mapping[str, Any] = field(default_factory=dict)
-    """How it was read: `by` ("logprobs" or "votes"), `mass` of the choices, whether it was `repaired`."""
+    """How it was read: `by` ("logprobs" or "votes"), `mass` of the choices, whether it was `doubtful`, `repaired` or
+    `adapted` (keys or values read in another form than they were written in)."""
     problem: str = ""
     """Why the answer could not be used, "<kind>: <detail>"; empty if it could."""
     instead: str = ""

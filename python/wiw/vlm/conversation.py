@@ -72,8 +72,7 @@ def _read_reply(request: Request, completion: Completion) -> Reply:
     outcome = structured.parse_object(completion, request.schema)
     if isinstance(outcome, Problem):
         return Reply(completion.text, problem=outcome)
-    value, repaired = outcome
-    return Reply(completion.text, value, repaired=repaired)
+    return Reply(completion.text, outcome.value, repaired=outcome.repaired, adapted=outcome.adapted)
 
 
 def _make_call(request: Request, attempt: int) -> Call:

@@ -154,6 +154,8 @@ class Reply:
     """"logprobs", or "votes" where the server returns no log-probabilities."""
     repaired: bool = False
     """Whether JSON syntax errors were repaired."""
+    adapted: bool = False
+    """Whether keys or values were read in another form than they were written in."""
     problem: Problem | None = None
     completions: tuple[CompletionRecord, ...] = field(default=(), repr=False)
     model: str = ""

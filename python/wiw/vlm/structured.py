@@ -6,7 +6,7 @@ from __future__ import annotations
 import json
 import re
 from collections.abc import Iterator
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 from wiw.vlm.messages import Completion, Kind, Problem
 
@@ -21,6 +21,17 @@ REFUSED = ("refusal", "content_filter")
 """Ends of an answer that the model or its server withheld."""
 _SYNTAX = re.compile(r"""\\["'\\/bfnrt]|[\s"'`,:;\[\]{}\u2018\u2019\u201c\u201d]""")
 _REFUSALS = ("i'm sorry", "i am sorry", "i can't", "i cannot", "sorry,", "i'm unable", "i am unable", "as an ai")
+
+
+class ParsedObject(NamedTuple):
+    """An object that was found in a completion."""
+
+    value: Any
+    """Validated by the schema."""
+    repaired: bool
+    """Whether its syntax was repaired."""
+    adapted: bool
+    """Whether the schema's model read it in another form than it was written in: keys, case, numbers as text."""
 
 
 def make_problem(kind: Kind, detail: str, completion: Completion) -> Problem:
@@ -39,8 +50,8 @@ def find_problem(completion: Completion) -> Problem | None:
     return None
 
 
-def parse_object(completion: Completion, schema: type[BaseModel]) -> tuple[Any, bool] | Problem:
-    """Return the object in a completion and whether its syntax was repaired, or why there is none.
+def parse_object(completion: Completion, schema: type[BaseModel]) -> ParsedObject | Problem:
+    """Return the object in a completion and how it was read, or why there is none.
 
     Of several objects, the last that fits the schema is the answer; what a model thinks aloud before it does not count.
     """
@@ -64,14 +75,15 @@ def parse_object(completion: Completion, schema: type[BaseModel]) -> tuple[Any, 
     return problem
 
 
-def _read_object(text: str, whole: bool, completion: Completion, schema: type[BaseModel]) -> tuple[Any, bool] | Problem:
+def _read_object(text: str, whole: bool, completion: Completion, schema: type[BaseModel]) -> ParsedObject | Problem:
     from pydantic import ValidationError
 
     if not whole:
         return make_problem("truncated", f"the JSON object does not end (finish: {completion.finish})", completion)
     try:
         values, repaired = _load_json(text)
-        return schema.model_validate(values), repaired
+        value = schema.model_validate(values)
+        return ParsedObject(value, repaired, value.model_dump(mode="json") != values)
     except ValidationError as error:
         first = error.errors(include_url=False, include_input=False)[0]
         place = ".".join(str(part) for part in first["loc"]) or "the object"

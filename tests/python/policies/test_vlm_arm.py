@@ -199,6 +199,14 @@ def test_unusable_answers_are_asked_for_again_and_then_a_pose_is_drawn(text: str
     assert "the plan was left out" in decision.note and "the first plan was taken" in decision.note
 
 
+def test_harmless_variations_are_read() -> None:
+    written = json.loads(write_answer(ABOVE)) | {"confidence": 0.8}
+    del written["reasoning_and_reflection"]
+    client = MockClient(lambda call: json.dumps(written))
+    decision = decide_at_table(ArmVLM(client, tries=2))
+    assert len(client.calls) == 1 and decision.exchanges[0].problem == "" and decision.exchanges[0].result["adapted"]
+
+
 def test_slips_of_syntax_are_mended() -> None:
     slip = write_answer(ABOVE).replace('"language_plan"', "language_plan")
     decision = decide_at_table(ArmVLM(MockClient(lambda call: f"Here you are:\n{slip}")))

@@ -112,6 +112,22 @@ def test_commands_have_the_papers_fields_and_name_what_is_marked() -> None:
     assert "plans" in parse(listed, {"plans": [command()] * 3})
 
 
+def test_commands_walks_and_answers_are_read_in_harmless_variations() -> None:
+    schema = commands.command_schema((1, 4))
+    assert parse(schema, command(answer=4)).answer == "4" and parse(schema, command(answer=2.5)).answer == "2.5"
+    assert parse(commands.answer_schema(), {"answer": 3}).answer == "3"
+    for ambiguous in (True, ["red"], {"colour": "red"}, float("nan")):
+        assert "answer" in parse(schema, command(answer=ambiguous))
+    assert parse(schema, command("Left", plan="Go.") | {"confidence": 0.9}).chosen_view == "left"
+    unreasoned = {key: value for key, value in command().items() if key != "reason"}
+    assert parse(schema, unreasoned).reason == "" and "chosen_view" in parse(schema, command("front left"))
+    silent = commands.command_schema((1,), answers=False)
+    assert parse(silent, command(answer="none")).action_plan == "Go on.", "null says nothing"
+    steps = {"actions": [{"action": "Turn Left", "times": 2, "why": "a wall"}, {"action": "STOP", "times": 1}]}
+    assert commands.parse_walk(parse(commands.walk_schema(), steps)).tolist() == [LEFT] * 2
+    assert "action_plan" in parse(schema, {"chosen_view": "front", "chosen_landmark": None, "answer": None})
+
+
 VALUES = st.none() | st.booleans() | st.integers() | st.floats() | st.text() | st.lists(st.integers(), max_size=2)
 
 

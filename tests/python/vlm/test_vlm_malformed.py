@@ -5,6 +5,7 @@ from __future__ import annotations
 
 import json
 import math
+import re
 import string
 from collections.abc import Iterator
 from typing import Any, get_args
@@ -68,9 +69,15 @@ def replies_without_a_plan() -> Iterator[str]:
     for reason in (None, 1, [], {}):
         yield json.dumps({"reason": reason, "actions": ACTIONS})
     yield from (
-        json.dumps(value) for value in ({"reason": "r"}, {"actions": ACTIONS}, {"Actions": ACTIONS, "reason": "r"})
+        json.dumps(value)
+        for value in (
+            {"reason": "r"},
+            {"Actions": ACTIONS, "reason": "r"},
+            {"actions": ACTIONS, "Reason": "r"},
+            {"actions": ACTIONS, "reason": "r", "Actions": ["forward"]},
+            {"actions": ["forward left"], "reason": "r"},
+        )
     )
-    yield json.dumps({"reason": "r", "actions": ACTIONS, "confidence": 1})
     yield json.dumps({"answer": {"reason": "r", "actions": ACTIONS}})
     yield from ("[" * depth + "]" * depth for depth in (10, 1000, 50_000))
     yield from ('{"a":' * depth + "1" + "}" * depth for depth in (10, 500, 5000, 13_000))
@@ -102,9 +109,9 @@ def replies_without_a_plan() -> Iterator[str]:
 CORPUS = list(dict.fromkeys(replies_without_a_plan()))
 
 
-def plan_of(text: str, finish: str = "stop") -> Any:
+def plan_of(text: str, finish: str = "stop", count: int = 1) -> Any:
     client = MockClient(lambda call: Completion(text, finish))
-    (reply,) = client.ask([Request((user("Plan!"),), schema=plan_schema(5), tries=1)])
+    (reply,) = client.ask([Request((user("Plan!"),), schema=plan_schema(5, count), tries=1)])
     return reply
 
 
@@ -118,7 +125,8 @@ def held(text: str, finish: str = "stop") -> None:
         return
     ((actions, reason),) = parse_plans(reply.value)
     assert 1 <= len(actions) <= 5 and isinstance(reason, str)
-    rest = text[text.index("actions") :] if text.index("actions") > text.index("reason") else text
+    rest = text[text.index("actions") :] if text.index("actions") > text.find("reason") else text
+    rest = re.sub(r"[\s_-]+", "_", rest.casefold())
     for name in reply.value.actions:
         rest = rest[rest.index(name) + len(name) :]
 
@@ -132,6 +140,25 @@ def test_no_plan_is_made_out_of_an_answer_that_holds_none() -> None:
         reply = plan_of(text)
         assert reply.problem is not None and reply.problem.kind in KINDS, f"a plan out of {text[:200]!r}"
         held(text)
+
+
+@pytest.mark.parametrize(
+    "said",
+    [
+        {"actions": ACTIONS},
+        {"reason": "r", "actions": ACTIONS, "confidence": 1},
+        {"reason": "r", "actions": ["Forward", "Turn Left", "TURN-RIGHT", " forward "]},
+        {"thoughts": ["a", "wall"], "actions": ["forward", "turn  left", "Turn_Right", "FORWARD"]},
+    ],
+)
+def test_harmless_variations_are_read_and_recorded(said: dict[str, Any]) -> None:
+    for text in (json.dumps(said), f"Here it is: {json.dumps(said)}"):
+        reply = plan_of(text)
+        assert reply.problem is None and reply.adapted and not reply.repaired
+        assert reply.value.actions == ACTIONS and reply.value.reason == said.get("reason", "")
+    listed = plan_of(json.dumps({"plans": [said], "number": 1}), count=2)
+    assert [plan.actions for plan in listed.value.plans] == [ACTIONS]
+    assert plan_of(GOOD).problem is None and not plan_of(GOOD).adapted
 
 
 def test_every_kind_of_problem_is_found() -> None:

@@ -5,12 +5,13 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from functools import lru_cache
-from typing import TYPE_CHECKING, Any, Literal
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from wiw.action import FORWARD, TURN_LEFT, TURN_RIGHT
+from wiw.policies.vlm.answer_models import create_answer_model, make_name_type
 
 if TYPE_CHECKING:
     from pydantic import BaseModel
@@ -29,22 +30,21 @@ def plan_schema(longest: int, count: int = 1) -> type[BaseModel]:
     """Return the schema {reason, actions} with 1 to `longest` primitives; {plans: [...]} of up to `count` of them where
     count > 1.
     """
-    from pydantic import ConfigDict, Field, create_model
+    from pydantic import Field
 
-    names = Literal["forward", "turn_left", "turn_right"]
-    strict: Any = ConfigDict(extra="forbid")
-    actions: Any = (list[names], Field(min_length=1, max_length=longest))
-    return allow_several(create_model("Plan", __config__=strict, reason=(str, ...), actions=actions), count)
+    actions: Any = (list[make_name_type(tuple(PRIMITIVES))], Field(min_length=1, max_length=longest))
+    plan = create_answer_model("Plan", reasons=("reason",), reason=(str, ...), actions=actions)
+    return allow_several(plan, count)
 
 
 def allow_several(plan: type[BaseModel], count: int) -> type[BaseModel]:
     """Return the schema {plans: [...]} of up to `count` plans; that of a single plan where count is 1."""
-    from pydantic import ConfigDict, Field, create_model
+    from pydantic import Field
 
     if count == 1:
         return plan
     plans: Any = (list[plan], Field(min_length=1, max_length=count))  # type: ignore[valid-type]
-    return create_model(f"{plan.__name__}s", __config__=ConfigDict(extra="forbid"), plans=plans)
+    return create_answer_model(f"{plan.__name__}s", plans=plans)
 
 
 def list_plans(value: Any) -> list[Any]:

@@ -556,7 +556,8 @@ class VLM(Policy):
 
     def _describe_reading(self, reply: Reply) -> dict[str, Any]:
         """Return how an answer was read, without empty entries."""
-        return {"by": reply.by, "mass": reply.mass, "doubtful": reply.doubtful, "repaired": reply.repaired}
+        choice = {"by": reply.by, "mass": reply.mass, "doubtful": reply.doubtful}
+        return {**choice, "repaired": reply.repaired, "adapted": reply.adapted}
 
     def _record_exchange(self, key: Key, purpose: str, reply: Reply, instead: str) -> None:
         """Record a question's outcome."""

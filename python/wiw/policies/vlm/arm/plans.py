@@ -11,6 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from wiw.action import PoseGrid
+from wiw.policies.vlm.answer_models import create_answer_model
 from wiw.policies.vlm.plans import allow_several, list_plans
 from wiw.tabletop.workbench import TABLE
 from wiw.types import Proposal
@@ -35,17 +36,16 @@ def plan_schema(longest: int, count: int = 1) -> type[BaseModel]:
 
     Servers receive the range of the numbers; numbers outside are read as `PoseGrid` does.
     """
-    from pydantic import ConfigDict, Field, WithJsonSchema, create_model
+    from pydantic import Field, WithJsonSchema
 
-    strict: Any = ConfigDict(extra="forbid")
     sent = WithJsonSchema({"type": "integer", "minimum": 0, "maximum": max(GRID.bins, GRID.turns)})
     number = Annotated[int, Field(ge=-NUMBER_LIMIT, le=NUMBER_LIMIT), sent]
     numbers: Any = (list[number], Field(min_length=7, max_length=7))
-    step = create_model("Step", __config__=strict, action=numbers)
+    step = create_answer_model("Step", action=numbers)
     steps: Any = (list[step], Field(min_length=1, max_length=longest))  # type: ignore[valid-type]
-    plan: type[BaseModel] = create_model(
+    plan = create_answer_model(
         "Plan",
-        __config__=strict,
+        reasons=("reasoning_and_reflection",),
         visual_state_description=(str, ...),
         reasoning_and_reflection=(str, ...),
         language_plan=(str, ...),

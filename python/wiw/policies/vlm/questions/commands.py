@@ -17,6 +17,7 @@ from numpy.typing import NDArray
 from wiw.mapping.landmarks import Landmark
 from wiw.mapping.marks import MarkedViews
 from wiw.mapping.views import VIEW_NAMES
+from wiw.policies.vlm.answer_models import create_answer_model, make_name_type, read_null, read_text
 from wiw.policies.vlm.plans import PRIMITIVES, allow_several, list_plans
 from wiw.policies.vlm.policy import shorten
 
@@ -29,8 +30,6 @@ STOP = "stop"
 WALK_NAMES = (*PRIMITIVES, STOP)
 LONGEST_ANSWER = 300
 """Characters of an answer."""
-_NOTHING = ("", "none", "null", "n/a")
-"""Words that models write for null."""
 
 
 @dataclass(frozen=True)
@@ -61,47 +60,45 @@ def command_schema(marks: tuple[int, ...], count: int = 1, answers: bool = True)
         count: how many commands are requested.
         answers: whether a command comes with an answer; not where imagined views are shown.
     """
-    from pydantic import ConfigDict, Field, create_model, field_validator
+    from pydantic import Field, field_validator
 
-    strict: Any = ConfigDict(extra="forbid")
     landmark: Any = Literal[marks] | None if marks else None
     fields: dict[str, Any] = {
         "reason": (str, ...),
         "action_plan": (str, Field(min_length=1)),
-        "chosen_view": (Literal[VIEW_NAMES], ...),
+        "chosen_view": (make_name_type(VIEW_NAMES), ...),
         "chosen_landmark": (landmark, ...),
     }
     if answers:
         fields["answer"] = (str | None, Field(max_length=LONGEST_ANSWER))
     loose = {
         "read_landmark": field_validator("chosen_landmark", mode="before")(_read_number),
-        "read_answer": field_validator("answer", mode="before", check_fields=False)(_read_null),
+        "read_answer": field_validator("answer", mode="before", check_fields=False)(read_text),
     }
-    return allow_several(create_model("Command", __config__=strict, __validators__=loose, **fields), count)
+    refused = () if answers else ("answer",)
+    command = create_answer_model("Command", reasons=("reason",), refused=refused, validators=loose, **fields)
+    return allow_several(command, count)
 
 
 @lru_cache(maxsize=1)
 def answer_schema() -> type[BaseModel]:
     """Return the schema {reason, answer}."""
-    from pydantic import ConfigDict, Field, create_model, field_validator
+    from pydantic import Field, field_validator
 
-    loose = {"read_answer": field_validator("answer", mode="before")(_read_null)}
+    loose = {"read_answer": field_validator("answer", mode="before")(read_text)}
     answer: Any = (str | None, Field(max_length=LONGEST_ANSWER))
-    strict: Any = ConfigDict(extra="forbid")
-    return create_model("Answer", __config__=strict, __validators__=loose, reason=(str, ...), answer=answer)
+    return create_answer_model("Answer", reasons=("reason",), validators=loose, reason=(str, ...), answer=answer)
 
 
 @lru_cache(maxsize=1)
 def walk_schema() -> type[BaseModel]:
     """Return the schema {reason, actions: [{action, times}]} of a walk."""
-    from pydantic import ConfigDict, Field, create_model
+    from pydantic import Field
 
-    strict: Any = ConfigDict(extra="forbid")
     times: Any = (int, Field(ge=1, le=WALK_TIMES))
-    names: Any = (Literal[WALK_NAMES], ...)
-    step = create_model("Step", __config__=strict, action=names, times=times)
+    step = create_answer_model("Step", action=(make_name_type(WALK_NAMES), ...), times=times)
     actions: Any = (list[step], Field(min_length=1, max_length=WALK_ACTIONS))  # type: ignore[valid-type]
-    return create_model("Walk", __config__=strict, reason=(str, ...), actions=actions)
+    return create_answer_model("Walk", reasons=("reason",), reason=(str, ...), actions=actions)
 
 
 def parse_commands(value: Any, marked: MarkedViews) -> list[Command]:
@@ -145,12 +142,6 @@ def _parse_command(value: Any, marked: MarkedViews) -> Command:
     return Command(shorten(value.action_plan), view, mark, landmark, parse_answer(value))
 
 
-def _read_null(value: Any) -> Any:
-    """Read words for nothing, such as "None", as null."""
-    nothing = isinstance(value, str) and value.strip().casefold().rstrip(".") in _NOTHING
-    return None if nothing else value
-
-
 def _read_number(value: Any) -> Any:
     """Read a number in quotes as a number, and words for nothing as null."""
-    return int(value) if isinstance(value, str) and value.strip().isdecimal() else _read_null(value)
+    return int(value) if isinstance(value, str) and value.strip().isdecimal() else read_null(value)
