@@ -33,6 +33,9 @@ _PLAIN_MARK = re.compile(
     re.IGNORECASE,
 )
 
+_EMPHASIS = re.compile(r"(?<!\w)[*_`]+|[*_`]+(?!\w)")
+"""Markdown around words, as in "**Mark:** 4"."""
+
 
 class LanguageModelJudge(Judge):
     """Asks a language model for the mark of each answer; every mark comes with the model's raw reply.
@@ -205,7 +208,7 @@ def parse_mark(text: str, cut: bool = False) -> int:
 
 def _find_number(text: str) -> float | None:
     """Return the number that a text consists of, as a JSON object or in plain words."""
-    plain = _PLAIN_MARK.fullmatch(text)
+    plain = _PLAIN_MARK.fullmatch(_EMPHASIS.sub("", text).strip())
     if plain is not None:
         return float(plain[1])
     found, whole = [("", False), *iterate_json_objects(text)][-1]

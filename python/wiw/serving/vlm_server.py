@@ -44,6 +44,10 @@ class ClientGoneError(Exception):
     """The client of a request has hung up: nobody would read the answer."""
 
 
+class ModelFaultError(Exception):
+    """An error of the model or script behind the server, for which the request is not to blame."""
+
+
 class VlmServer:
     """Serves from `start` to `stop`; works as a context manager.
 
@@ -115,12 +119,18 @@ class VlmServer:
 
         Raises:
             ClientGoneError: the client hung up while others had their turn.
+            ModelFaultError: the model or script raised an error with which it does not refuse the request.
         """
         call = parse_call(body)
         with self._asking:
             if _has_hung_up(getattr(self.serving, "connection", None)):
                 raise ClientGoneError
-            (completion,) = self.client.complete([call])
+            try:
+                (completion,) = self.client.complete([call])
+            except (Error, ValueError):  # with which models and scripts refuse a request
+                raise
+            except Exception as error:
+                raise ModelFaultError(f"{type(error).__name__}: {error}") from error
         return completion
 
     def count_request(self, body: dict[str, Any]) -> int:

@@ -20,7 +20,7 @@ LETTER_CONTEXT = " \t\r\n\u2581\u0120\u010a().:*\"'`[]"
 byte-level BPE.
 """
 _VOTE = re.compile(
-    r"\W*(?:(?:the\s+)?(?:correct\s+)?(?:answer|option)(?:\s+is)?\s*:?\s*)?[(\[*\"'`]*([A-ZΓΔΘΛΞΠΣΦΨΩ])\s*(?:$|[.):,;*\]\n])",
+    r"\W*(?:(?:the\s+)?(?:correct\s+)?(?:answer|option)(?:\s+is)?[\s:*_]*)?[(\[*\"'`]*([A-ZΓΔΘΛΞΠΣΦΨΩ])\s*(?:$|[.):,;*\]\n])",
     re.IGNORECASE,
 )
 """Matches a letter that stands by itself; "A chair" and "I'm sorry" begin with words."""
@@ -83,7 +83,7 @@ def count_votes(texts: Sequence[str], labels: Sequence[str]) -> tuple[NDArray[np
 
 
 def parse_vote(text: str, labels: Sequence[str]) -> int | None:
-    """Return the label that a written answer begins with, e.g. "B", "(b) chair", "The answer is B."; None for other
+    """Return the label that a written answer begins with, e.g. "B", "(b) chair", "**Answer:** B"; None for other
     text.
     """
     match = _VOTE.match(text[:_VOTE_LENGTH])

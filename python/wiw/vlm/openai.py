@@ -14,6 +14,7 @@ from functools import cached_property
 from importlib import import_module
 from threading import Thread
 from typing import Any, Literal
+from urllib.parse import urlsplit, urlunsplit
 
 from wiw.errors import ArgumentError, DependencyError, VlmError
 from wiw.vlm.base import Client
@@ -31,13 +32,18 @@ LONGEST_WAIT = 60.0
 REFUSED_LOGPROBS = (
     "; set top_logprobs= to the number of first tokens that the server lists, or to 0 to vote on choices instead"
 )
+OPENAI_HOST = "api.openai.com"
+"""The only host that is told `$OPENAI_ORG_ID` and `$OPENAI_PROJECT_ID`."""
+QUOTA_WAIT = 8.0
+"""Seconds before a request is sent again for which there was no quota; doubled each time, as quotas are per minute."""
 NOBODY_THERE = (
     ": no server answers there; start one (docs/vlm.md), give another with --vlm URL, or use --vlm mock for a dry run "
     "without a model"
 )
 BROKEN = ("abort", "error", "cancelled")
 """Ends of a completion that the server broke off."""
-_PASSING = (408, 409, 425, 429)
+_NO_QUOTA = 429
+_PASSING = (408, 409, 425, _NO_QUOTA)
 """Client errors that may pass; so may all of the server's, 500 and above."""
 
 
@@ -55,6 +61,9 @@ class OpenAIClient(Client):
         image_format: "png", or "jpeg" for slow connections.
         key: the server's; None means `$OPENAI_API_KEY`.
         options: see `Client`.
+
+    Raises:
+        ArgumentError: an option out of range, or an address with a user or password, which would be recorded.
     """
 
     def __init__(
@@ -71,6 +80,7 @@ class OpenAIClient(Client):
         **options: Any,
     ) -> None:
         super().__init__(**options)
+        _refuse_credentials(base_url)
         if dialect not in DIALECTS or image_format not in ("png", "jpeg"):
             raise ArgumentError(
                 f"vlm: expected dialect {', '.join(DIALECTS)}, image_format png or jpeg, got {dialect}, {image_format}"
@@ -155,7 +165,10 @@ class OpenAIClient(Client):
 
         key = self._key or os.environ.get("OPENAI_API_KEY") or "none"
         http = openai.DefaultHttpxClient(event_hooks={"response": [self._cut_off]})
-        return openai.OpenAI(base_url=self.base_url, api_key=key, timeout=self.timeout, max_retries=0, http_client=http)
+        sdk = openai.OpenAI(base_url=self.base_url, api_key=key, timeout=self.timeout, max_retries=0, http_client=http)
+        if sdk.base_url.host != OPENAI_HOST:  # what the SDK reads from the environment is no business of others
+            sdk.organization = sdk.project = None
+        return sdk
 
     def _cut_off(self, response: Any) -> None:
         """Truncate the body of an error, which the SDK would read whole."""
@@ -218,11 +231,10 @@ class OpenAIClient(Client):
                 return _run_within(self.timeout, work, stopped)
             except openai.APIStatusError as error:
                 passing = error.status_code in _PASSING or error.status_code >= 500
-                said, kind, pause = (
-                    f"{error.status_code} {_shorten(error)}",
-                    "status" if passing else "refused",
-                    _read_retry_after(error),
-                )
+                said, kind = f"{error.status_code} {_shorten(error)}", "status" if passing else "refused"
+                pause = _read_retry_after(error)
+                if pause is None and error.status_code == _NO_QUOTA:
+                    pause = retries.pause_for_quota()
             except (openai.APITimeoutError, TimeoutError) as error:
                 passing, said, kind, pause = (
                     True,
@@ -301,6 +313,10 @@ class _Retries:
         """Return the seconds to wait: doubling from a half, with jitter."""
         return float(0.5 * 2**self.count * (0.75 + 0.5 * random.random()))
 
+    def pause_for_quota(self) -> float:
+        """Return the seconds to wait where the server has no quota left and does not say for how long."""
+        return float(QUOTA_WAIT * 2**self.count * (0.75 + 0.5 * random.random()))
+
 
 class _NoCompletionError(Exception):
     """A reply that is not a chat completion."""
@@ -336,6 +352,17 @@ def _begin(response: Any, seconds: float) -> Any:
             stream.close()
 
     return Begin()
+
+
+def _refuse_credentials(base_url: str) -> None:
+    """Check that an address has no user and password, which records and reports would show."""
+    address = urlsplit(base_url)
+    if address.username is not None or address.password is not None:
+        host = address.netloc.rpartition("@")[2]
+        raise ArgumentError(
+            f"vlm: expected an address without user and password, got one with them for {host}; addresses are "
+            f"recorded, so give {urlunsplit(address._replace(netloc=host))}, and the key as $OPENAI_API_KEY or key="
+        )
 
 
 def _rebuild_client(base_url: str, options: dict[str, Any]) -> OpenAIClient:

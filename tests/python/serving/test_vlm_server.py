@@ -37,7 +37,9 @@ from wiw.serving.vlm_server import VlmServer  # noqa: E402
 from wiw.vlm import Request, connect, user  # noqa: E402
 from wiw.vlm.cache import ReplyCache  # noqa: E402
 from wiw.vlm.mock import MockClient  # noqa: E402
+from wiw.vlm.openai import _Retries  # noqa: E402
 
+SECRET_HEADERS = ("OpenAI-Organization", "OpenAI-Project")
 IMAGE = np.random.default_rng(0).integers(0, 256, (40, 60, 3), np.uint8)
 
 
@@ -308,6 +310,7 @@ def test_two_servers_with_models_of_one_name_do_not_share_answers(tmp_path: Path
 @pytest.mark.parametrize("wait", ["nan", "-1", "soon", "Mon, 01 Jan 99999 00:00:00 GMT"])
 def test_odd_wishes_to_wait_do_no_harm(wait: str, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("wiw.vlm.openai._Retries.pause", lambda self: 0.0)
+    monkeypatch.setattr("wiw.vlm.openai._Retries.pause_for_quota", lambda self: 0.0)
     send_header = BaseHTTPRequestHandler.send_header
 
     def odd(self: Any, name: str, value: str) -> None:
@@ -319,6 +322,59 @@ def test_odd_wishes_to_wait_do_no_harm(wait: str, monkeypatch: pytest.MonkeyPatc
         pytest.raises(VlmError) as error,
     ):
         connect(server.url, attempts=2).ask(REQUESTS[2:3])
+    assert error.value.kind == "status"
+
+
+def test_a_server_without_quota_is_given_a_minute(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Quotas are per minute; hosted models do not always say how long to wait."""
+    pauses = []
+
+    def note_pause(self: Any) -> float:
+        pauses.append(pause(self))
+        return 0.0
+
+    pause = _Retries.pause_for_quota
+    monkeypatch.setattr(_Retries, "pause_for_quota", note_pause)
+    monkeypatch.setattr(_Retries, "pause", lambda self: 0.0)
+    send_header = BaseHTTPRequestHandler.send_header
+    monkeypatch.setattr(
+        BaseHTTPRequestHandler,
+        "send_header",
+        lambda self, name, value: send_header(self, "X-Other" if name == "Retry-After" else name, value),
+    )
+    for fault, tries in (("429", 4), ("500", 0)):
+        pauses.clear()
+        with MisbehavingVlmServer(MockClient(), misbehaviour=failing({fault: 1.0})) as server:
+            with pytest.raises(VlmError, match=rf"{fault}.*\(4 tries\)"):
+                connect(server.url, model="mock").ask(REQUESTS[2:3])
+            assert server.count == 4 and len(pauses) == tries
+        assert sorted(pauses) == pauses and (not pauses or sum(pauses[:-1]) > 40), "none follows the last"
+
+
+def test_an_address_with_a_password_is_refused_and_not_repeated() -> None:
+    with pytest.raises(ArgumentError, match=r"https://host:8443/v1.*OPENAI_API_KEY") as error:
+        connect("https://me:s3cret@host:8443/v1", model="m")
+    assert "s3cret" not in str(error.value)
+
+
+def test_what_is_of_openai_is_told_to_openai_alone(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("OPENAI_ORG_ID", "org-mine")
+    monkeypatch.setenv("OPENAI_PROJECT_ID", "project-mine")
+    for url, told in (("https://api.openai.com/v1", True), ("http://127.0.0.1:8000/v1", False)):
+        headers = connect(url, model="m")._sdk.default_headers
+        assert [headers.get(name) in ("org-mine", "project-mine") for name in SECRET_HEADERS] == [told, told]
+
+
+@pytest.mark.parametrize("fault", [KeyError("plan"), IndexError("none"), TypeError("odd")])
+def test_an_error_of_the_script_is_the_servers_not_the_clients(fault: Exception) -> None:
+    def script(call: Any) -> str:
+        raise fault
+
+    with (
+        VlmServer(MockClient(script)) as server,
+        pytest.raises(VlmError, match=rf"500.*{type(fault).__name__}.*{fault.args[0]}") as error,
+    ):
+        connect(server.url, attempts=1).ask(REQUESTS[2:3])
     assert error.value.kind == "status"
 
 

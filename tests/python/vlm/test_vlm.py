@@ -81,6 +81,7 @@ def test_tokens_that_a_server_forbids_count_nothing() -> None:
     ("text", "vote"),
     [
         ("B", 1), ("b", 1), (" (B) chair", 1), ("B. chair", 1), ("**B**", 1), ("The answer is C.", 2), ("Answer: A", 0),
+        ("**Answer:** B", 1), ("**Answer**: **C**", 2), ("**Answer:** A chair", None),
         ("A chair", None), ("I'm sorry", None), ("Bad", None), ("", None), ("D", None), ("It is B", None),
         ("?" * 5000, None),
     ],
