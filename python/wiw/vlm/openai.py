@@ -21,8 +21,8 @@ from wiw.vlm.base import Client
 from wiw.vlm.images import ImageFormat, to_data_uri
 from wiw.vlm.messages import Call, Completion, Message
 
-Dialect = Literal["openai", "vllm", "legacy"]
-DIALECTS = ("openai", "vllm", "legacy")
+Dialect = Literal["openai", "reasoning", "vllm", "legacy"]
+DIALECTS = ("openai", "reasoning", "vllm", "legacy")
 MOST_BYTES = 4 << 20
 """Maximum size of a reply's body in bytes; what goes beyond is not read."""
 MOST_OF_AN_ERROR = 1 << 16
@@ -36,6 +36,9 @@ OPENAI_HOST = "api.openai.com"
 """The only host that is told `$OPENAI_ORG_ID` and `$OPENAI_PROJECT_ID`."""
 QUOTA_WAIT = 8.0
 """Seconds before a request is sent again for which there was no quota; doubled each time, as quotas are per minute."""
+REFUSED_SAMPLING = (
+    "; set dialect=reasoning for a model that thinks first: it sends max_completion_tokens, no temperature"
+)
 NOBODY_THERE = (
     ": no server answers there; start one (docs/vlm.md), give another with --vlm URL, or use --vlm mock for a dry run "
     "without a model"
@@ -53,8 +56,11 @@ class OpenAIClient(Client):
     Args:
         base_url: such as "http://localhost:8000/v1".
         model: its name there; None means the only one that the server offers.
-        dialect: how choices and schemas are sent beside the prompt. "openai": `response_format`; "vllm":
-            `structured_outputs` too, for choices; "legacy": `guided_choice` and `guided_json` (vLLM before 0.12).
+        dialect: how choices and schemas are sent beside the prompt. "openai": `response_format`; "reasoning": the same,
+            for hosted models that think first: the limit is `max_completion_tokens`, and no temperature is sent;
+            "vllm": `structured_outputs` too, for choices; "legacy": `guided_choice` and `guided_json` (vLLM before
+            0.12).
+        thinking_tokens: how many tokens a model of dialect "reasoning" may think with, beside those of its answer.
         concurrency: maximum number of requests at a time.
         timeout: seconds that one request may take.
         attempts: times that it is sent in all while the server is busy or fails; how long it asks to wait is heeded.
@@ -72,6 +78,7 @@ class OpenAIClient(Client):
         model: str | None = None,
         *,
         dialect: Dialect = "openai",
+        thinking_tokens: int = 8192,
         concurrency: int = 8,
         timeout: float = 120.0,
         attempts: int = 4,
@@ -85,16 +92,19 @@ class OpenAIClient(Client):
             raise ArgumentError(
                 f"vlm: expected dialect {', '.join(DIALECTS)}, image_format png or jpeg, got {dialect}, {image_format}"
             )
-        if concurrency < 1 or attempts < 1 or not timeout > 0:
+        if concurrency < 1 or attempts < 1 or not timeout > 0 or thinking_tokens < 0:
             raise ArgumentError(
-                f"vlm: expected concurrency, attempts and timeout above 0, got {concurrency}, {attempts}, {timeout}"
+                "vlm: expected concurrency, attempts and timeout above 0, and thinking_tokens of 0 or more, got "
+                f"{concurrency}, {attempts}, {timeout}, {thinking_tokens}"
             )
         self.base_url, self.dialect, self.image_format = base_url, dialect, image_format
+        self.thinking_tokens = thinking_tokens
         self.concurrency, self.timeout, self.attempts = concurrency, timeout, attempts
         self._model, self._key = model, key
         self._given: dict[str, Any] = {
             "model": model,
             "dialect": dialect,
+            "thinking_tokens": thinking_tokens,
             "concurrency": concurrency,
             "key": key,
         }
@@ -122,7 +132,8 @@ class OpenAIClient(Client):
     @property
     def manner(self) -> str:
         """The images' format, what constrains the answer, and the server: others may have another model of its name."""
-        return f"{self.image_format} {self.dialect} {self.base_url}"
+        thinking = f" {self.thinking_tokens}" if self.dialect == "reasoning" else ""
+        return f"{self.image_format} {self.dialect}{thinking} {self.base_url}"
 
     def complete(self, calls: Sequence[Call]) -> list[Completion]:
         """All calls, at most `concurrency` at a time."""
@@ -179,14 +190,16 @@ class OpenAIClient(Client):
         body: dict[str, Any] = {
             "model": self.model,
             "messages": [_message(message, images) for message in call.messages],
-            "temperature": call.temperature,
             "seed": call.seed,
-            "max_tokens": call.max_tokens,
         }
+        if self.dialect == "reasoning":
+            body["max_completion_tokens"] = call.max_tokens + self.thinking_tokens
+        else:
+            body |= {"temperature": call.temperature, "max_tokens": call.max_tokens}
         if call.logprobs:
             body |= {"logprobs": True, "top_logprobs": call.logprobs}
         extra: dict[str, Any] = {}
-        if call.labels and self.dialect != "openai":
+        if call.labels and self.dialect in ("vllm", "legacy"):
             choice = list(call.labels)
             extra = (
                 {"guided_choice": choice} if self.dialect == "legacy" else {"structured_outputs": {"choice": choice}}
@@ -250,12 +263,19 @@ class OpenAIClient(Client):
                 passing, said, kind, pause = True, f"{type(error).__name__}: {_shorten(error)}", "unreachable", None
             if not passing or retries.count + 1 >= self.attempts:
                 times = f"{retries.count + 1} tries" if retries.count else "1 try"
-                hint = REFUSED_LOGPROBS if kind == "refused" and "logprob" in said else ""
+                hint = _explain_refusal(said) if kind == "refused" else ""
                 hint = NOBODY_THERE if said.startswith("APIConnectionError") else hint
                 raise VlmError(f"{self.base_url}: {said} ({times}){hint}", kind)
             if wait([stopped], min(LONGEST_WAIT, max(pause or 0.0, retries.pause()))).done:
                 raise CancelledError
             retries.count += 1
+
+
+def _explain_refusal(said: str) -> str:
+    """Return what to do about a request that was refused, by what the server says of it; empty if that is unknown."""
+    if "logprob" in said:
+        return REFUSED_LOGPROBS
+    return REFUSED_SAMPLING if "max_tokens" in said or "temperature" in said else ""
 
 
 def _iterate_results(sent: Mapping[Future[Completion], int]) -> Iterator[tuple[int, Completion]]:

@@ -325,6 +325,24 @@ def test_odd_wishes_to_wait_do_no_harm(wait: str, monkeypatch: pytest.MonkeyPatc
     assert error.value.kind == "status"
 
 
+def test_a_model_that_thinks_first_gets_its_own_limit_and_no_temperature() -> None:
+    """As OpenAI's, which refuse the other names."""
+
+    class Thinker(VlmServer):
+        def respond(self, body: dict[str, Any], number: int) -> Any:
+            for name in {"max_tokens", "temperature"} & set(body):
+                raise ArgumentError(f"Unsupported parameter: '{name}' is not supported with this model.")
+            return super().respond(body, number)
+
+    with Thinker(MockClient()) as server:
+        with pytest.raises(VlmError, match=r"dialect=reasoning") as error:
+            connect(server.url, attempts=1).ask(REQUESTS[1:2])
+        assert error.value.kind == "refused"
+        replies = connect(server.url, dialect="reasoning", thinking_tokens=90).ask(REQUESTS[1:3])
+        assert all(reply.problem is None for reply in replies)
+        assert server.requests[-1]["max_completion_tokens"] == 10 + 90
+
+
 def test_a_server_without_quota_is_given_a_minute(monkeypatch: pytest.MonkeyPatch) -> None:
     """Quotas are per minute; hosted models do not always say how long to wait."""
     pauses = []
