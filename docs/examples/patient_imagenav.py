@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""A variant of a task that is there: Image-Goal Navigation that counts only where the agent says that it is there."""
+"""A variant of an existing task: Image-Goal Navigation that succeeds only if the agent itself stops at the goal."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ from wiw.tasks.imagenav import ImageNav
 
 
 class PatientImageNav(ImageNav):
-    """The goal is reached where the agent stops within its radius."""
+    """Succeeds if the agent stops within the goal's radius."""
 
     name = "patient-imagenav"
 

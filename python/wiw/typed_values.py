@@ -10,6 +10,8 @@ from pathlib import Path
 from types import NoneType, UnionType
 from typing import Any, Literal, Union, get_args, get_origin, get_type_hints
 
+import numpy as np
+
 from wiw.errors import ArgumentError
 from wiw.suggestions import did_you_mean
 
@@ -43,6 +45,21 @@ def read_values(declared: type, values: Mapping[str, Any], where: str, noun: str
     require_known(values, [field.name for field in fields(declared)], where, noun)
     kinds = get_type_hints(declared)
     return {name: _read_value(value, kinds[name], f"{where}: {name}") for name, value in values.items()}
+
+
+def require_types(where: str, settings: Any) -> None:
+    """Check that the fields of a dataclass have the types that it declares; numpy's numbers become Python's.
+
+    Raises:
+        ArgumentError: one has another type; says where, which, and what is expected.
+    """
+    kinds = get_type_hints(type(settings))
+    for field in fields(settings):
+        value = getattr(settings, field.name)
+        if isinstance(value, np.generic):
+            value = value.item()
+            object.__setattr__(settings, field.name, value)  # of a frozen one, too
+        _read_value(value, kinds[field.name], f"{where}: {field.name}")
 
 
 def require_positive(where: str, settings: object, *names: str) -> None:

@@ -6,6 +6,7 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass
 from functools import cache
+from numbers import Real
 from typing import Any
 
 import numpy as np
@@ -125,6 +126,11 @@ def power(
     Raises:
         ArgumentError: impossible numbers; both a difference and scenes, or neither.
     """
+    numbers = {"difference": difference, "scenes": scenes, "base": base, "losses": losses, "correlation": correlation}
+    numbers |= {"per_scene": per_scene, "chance": chance, "arms": arms, "seed": seed}
+    for name, value in numbers.items():
+        if value is not None and (isinstance(value, bool) or not isinstance(value, Real)):
+            raise ArgumentError(f"power: {name}: expected a number, got {value!r}")
     if (difference is None) == (scenes is None):
         raise ArgumentError(
             "power: expected either a difference (to compute the scenes it needs) or a number of scenes (to compute "

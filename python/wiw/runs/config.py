@@ -14,6 +14,7 @@ from wiw.errors import ArgumentError
 from wiw.ray_cluster import Engine
 from wiw.runs.limits import Limits
 from wiw.runs.shards import Shard
+from wiw.typed_values import require_types
 from wiw.types import check_seed
 
 
@@ -81,6 +82,7 @@ class RunConfig(Limits, EngineConfig):
     """Whether to show progress bars."""
 
     def __post_init__(self) -> None:
+        require_types("evaluate", self)
         super().__post_init__()
         for name, least in (("episodes", 1), ("workers", 1), ("live", 1), ("keep_images", 0), ("look_every", 1)):
             value = getattr(self, name)

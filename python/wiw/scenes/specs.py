@@ -7,6 +7,7 @@ import difflib
 import re
 from os import PathLike, fspath
 from pathlib import Path
+from typing import Any
 
 from wiw import _core
 from wiw.errors import ArgumentError, FileError
@@ -36,8 +37,12 @@ def strip_edits(spec: str) -> str:
 
 
 def absolute(spec: str | PathLike[str]) -> str:
-    """Return the spec, made absolute if it is a path, so that it means the same in any folder."""
-    spec = fspath(spec)
+    """Return the spec, made absolute if it is a path, so that it means the same in any folder.
+
+    Raises:
+        ArgumentError: it is neither text nor a path.
+    """
+    spec = _require_text(spec)
     scan = formats.parse_spec(spec)
     if scan is not None:
         kind, folder, split = scan
@@ -58,7 +63,7 @@ def resolve(spec: str | PathLike[str]) -> list[str]:
         ArgumentError: the split, a number or an edit is invalid.
         FileError: the file does not exist, or the folder has no scan.
     """
-    spec = fspath(spec)
+    spec = _require_text(spec)
     scan = formats.parse_spec(spec)
     if scan is not None:
         return [str(file) for file in formats.find_scans(*scan)]
@@ -83,6 +88,20 @@ def resolve(spec: str | PathLike[str]) -> list[str]:
     if mark:
         raise ArgumentError(f"scene spec '{spec}': edits belong to a single apartment; expected {_FORMS}.")
     return [f"apartments:{split}/{i}" for i in numbers]
+
+
+def _require_text(spec: Any) -> str:
+    """Return a spec as text.
+
+    Raises:
+        ArgumentError: it is neither text nor a path.
+    """
+    if isinstance(spec, str | PathLike):
+        return fspath(spec)
+    raise ArgumentError(
+        f"scene spec: expected text such as apartments:val:40:60, which names scenes 40 to 59, or a path, got {spec!r}"
+        "; for scenes of your choice, give an episode file that names them (docs/how-to.md)"
+    )
 
 
 def _to_number(spec: str, digits: str) -> int:

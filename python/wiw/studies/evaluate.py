@@ -5,7 +5,8 @@ from __future__ import annotations
 
 import sys
 import time
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from dataclasses import asdict, fields, replace
 from datetime import datetime
 from pathlib import Path
@@ -34,6 +35,7 @@ from wiw.runs.servers import require_servable
 from wiw.runs.shards import Shard
 from wiw.runs.store import RunStore, leave_resumable
 from wiw.studies.run_log import RunLog
+from wiw.suggestions import did_you_mean
 from wiw.types import Episode
 
 
@@ -108,7 +110,21 @@ def _find_task(env_or_task: Any, options: dict[str, Any], settings: RunConfig) -
     """Return the task; one by name takes its episodes from the run's seed, as on the command line."""
     if isinstance(env_or_task, str) and settings.seed is not None:
         options = {"seed": settings.seed, **options}
-    return task_recipe(env_or_task, options)
+    with _hint_at_settings(options):
+        return task_recipe(env_or_task, options)
+
+
+@contextmanager
+def _hint_at_settings(options: Iterable[str]) -> Iterator[None]:
+    """Add to an error about an option of the task which setting of the run may be meant, where it is like one."""
+    try:
+        yield
+    except ArgumentError as error:
+        names = [field.name for field in fields(RunConfig)]
+        hints = [did_you_mean(name, names) for name in options if name in str(error).partition(";")[0]]
+        if not any(hints):
+            raise
+        raise ArgumentError(f"{error} Among the settings of the run:{next(filter(None, hints))}") from None
 
 
 def resume_run(
@@ -170,7 +186,8 @@ def _run(task: Any, agents: Mapping[str, Any], settings: RunConfig, more_arms: b
     require_semantics_use(agents)
     if settings.lpips is not None:
         Lpips(settings.lpips)  # report missing weights before anything is run
-    built = task.build()
+    with _hint_at_settings(task.options if isinstance(task, TaskRecipe) else ()):
+        built = task.build()
     seed = built.seed if settings.seed is None else settings.seed
     count = built.default_episodes if settings.episodes is None else settings.episodes
     config = {

@@ -166,6 +166,12 @@ def test_the_correlation_of_a_pilot_is_that_of_its_scenes():
 
 
 @pytest.mark.usefixtures("fewer_runs")
+@pytest.mark.parametrize("given", [{"difference": "10"}, {"difference": [10]}, {"difference": 10, "base": "20"}])
+def test_what_is_no_number_is_refused(given):
+    with pytest.raises(ArgumentError, match=r"power: (difference|base): expected a number, got"):
+        wiw.power(**given)
+
+
 def test_two_models_five_points_apart_on_each_task(capsys):
     assert main(["power", "5", "--task", "all"]) == 0
     shown = capsys.readouterr().out

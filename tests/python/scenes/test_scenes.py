@@ -607,3 +607,10 @@ def test_a_ceiling_closes_the_real_house(data_dir: Path) -> None:
     assert holes[0] > 0.5
     assert holes[1] == 0
     assert scene.instances[-1]["category"] == "ceiling"
+
+
+@pytest.mark.parametrize("spec", [["apartments:val/0", "apartments:val/1"], 3, None])
+def test_a_spec_is_text(spec):
+    for read in (scenes.resolve, scenes.absolute):
+        with pytest.raises(ArgumentError, match=r"scene spec: expected text such as .* got .*episode file"):
+            read(spec)

@@ -10,6 +10,7 @@ from contextlib import closing
 from dataclasses import dataclass
 from pathlib import Path
 
+import numpy as np
 import pytest
 from fakes import LineAgent, LineTask, agent_for
 from locations import PYTHON_TESTS
@@ -149,6 +150,41 @@ def test_what_cannot_be_pickled_is_refused_with_advice(tmp_path):
     agent.model = lambda: None
     with pytest.raises(InfrastructureError, match=r"path\.py:Class.*workers=1"):
         run(tmp_path / "run", workers=2, agent=agent)
+
+
+@pytest.mark.parametrize(
+    ("settings", "said"),
+    [
+        ({"episodes": "2"}, "evaluate: episodes: expected a whole number or null, got '2'"),
+        ({"episodes": 2.5}, "episodes: expected a whole number or null, got 2.5"),
+        ({"workers": "2"}, "workers: expected a whole number, got '2'"),
+        ({"progress": "no"}, "progress: expected true or false, got 'no'"),
+        ({"keep_images": "every"}, "keep_images: expected a whole number or all, got 'every'"),
+    ],
+)
+def test_settings_of_other_types_are_refused_before_anything_is_written(tmp_path, settings, said):
+    with pytest.raises(ArgumentError, match=said):
+        evaluate(LineTask(), LineAgent(), out=tmp_path / "run", **{"progress": False, **settings})
+    assert not (tmp_path / "run").exists()
+
+
+def test_numbers_of_numpy_are_numbers(tmp_path):
+    log = evaluate(LineTask(), LineAgent(), np.int64(2), workers=np.int32(1), out=tmp_path / "run", progress=False)
+    assert len(log.episodes) == 2 and load_run(tmp_path / "run").complete
+
+
+@pytest.mark.parametrize(
+    ("misspelt", "meant"), [("episode", "episodes"), ("worker", "workers"), ("keep_image", "keep_images")]
+)
+def test_a_misspelt_setting_is_told_from_an_option_of_the_task(misspelt, meant):
+    for task in ("imagenav", LineTask()):
+        with pytest.raises(
+            ArgumentError, match=f"'?{misspelt}'?.* Among the settings of the run: Did you mean {meant}"
+        ):
+            evaluate(task, LineAgent(), **{misspelt: 1})
+    with pytest.raises(ArgumentError) as error:
+        evaluate("imagenav", LineAgent(), decision=1)
+    assert "Did you mean decisions" in str(error.value) and "settings of the run" not in str(error.value)
 
 
 def test_arguments_are_checked(tmp_path):
