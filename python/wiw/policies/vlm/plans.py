@@ -32,7 +32,8 @@ def plan_schema(longest: int, count: int = 1) -> type[BaseModel]:
     """
     from pydantic import Field
 
-    actions: Any = (list[make_name_type(tuple(PRIMITIVES))], Field(min_length=1, max_length=longest))
+    primitive: Any = make_name_type(tuple(PRIMITIVES))
+    actions: Any = (list[primitive], Field(min_length=1, max_length=longest))
     plan = create_answer_model("Plan", reasons=("reason",), reason=(str, ...), actions=actions)
     return allow_several(plan, count)
 
