@@ -517,7 +517,8 @@ class Decision:
     spent: Mapping[str, float] = field(default_factory=dict)
     """Resources used, an equal share of the batch's: calls of the world model with their rows and frames, retries among
     the calls, cached_rows that needed no call, vlm_tokens; credits of a paid service. A language model adds vlm_calls,
-    vlm_cached, vlm_retries, vlm_input_tokens, vlm_output_tokens, and vlm_usd if its price is known.
+    vlm_cached, vlm_retries, vlm_input_tokens, vlm_output_tokens, vlm_usd if its price is known, and, where there are
+    any, the calls without a count of tokens (vlm_uncounted) and of models without a price (vlm_unpriced).
     """
     exchanges: tuple[Exchange, ...] = ()
     """Questions to a language model, and its answers."""

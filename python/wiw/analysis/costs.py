@@ -17,14 +17,21 @@ COLUMNS = (
     ("frames", "Frames of these rollouts."),
     ("calls", "Batches per episode sent to the model; a batch is divided among the episodes that share it."),
     ("cached", "Share of the rollouts from the cache."),
-    ("tokens", "Tokens per episode read and written by a language model."),
+    (
+        "tokens",
+        "Tokens per episode read and written by a language model; ≥ where a server did not count some.",
+    ),
     ("model s", "Seconds per episode inside the world model."),
     ("all s", "Seconds per episode, all stages."),
     ("rollouts / success", "Rollouts of the arm divided by its successes."),
     ("s / success", "Seconds of the arm divided by its successes."),
 )
 """Columns of the table and their meaning."""
-PRICE_COLUMN = ("$", "Dollars per episode for language models with known prices (--vlm-prices).")
+PRICE_COLUMN = (
+    "$",
+    "Dollars per episode for language models with known prices (--vlm-prices); ≥ where a model has none, or a server "
+    "did not count some tokens.",
+)
 """Further column, where any price is known."""
 LOST_COLUMNS = (
     ("lost calls", "Calls per episode for decisions that were interrupted by an error; not counted in other columns."),
@@ -82,6 +89,8 @@ class Costs:
         each = max(1, self.episodes)
         asked, spent = self.calls, self.spent
         rows = asked.get("rows", 0.0)
+        at_least = "≥" if spent.get("vlm_uncounted") else ""
+        at_least_paid = "≥" if spent.get("vlm_unpriced") else at_least
         found = {
             "decisions": f"{self.decisions / each:.1f}",
             "consulted": f"{asked.get('consultations', 0.0) / each:.1f}",
@@ -89,8 +98,8 @@ class Costs:
             "frames": f"{asked.get('frames', 0.0) / each:.1f}",
             "calls": f"{spent.get('calls', 0.0) / each:.1f}",
             "cached": f"{100 * spent.get('cached_rows', 0.0) / rows:.0f} %" if rows else "–",
-            "tokens": f"{tokens / each:.0f}" if (tokens := spent.get("vlm_tokens", 0.0)) else "–",
-            "$": f"{spent['vlm_usd'] / each:.4f}" if "vlm_usd" in spent else "–",
+            "tokens": f"{at_least}{tokens / each:.0f}" if (tokens := spent.get("vlm_tokens", 0.0)) else "–",
+            "$": f"{at_least_paid}{spent['vlm_usd'] / each:.4f}" if "vlm_usd" in spent else "–",
             "model s": f"{self.seconds.get('world_model', 0.0) / each:.2f}",
             "all s": f"{self.all_seconds / each:.2f}",
             "rollouts / success": _number(self.per_success(rows)) if rows else "–",

@@ -51,7 +51,8 @@ class Client(ABC):
         self.cache, self.prices, self.top_logprobs, self.votes = cache, prices or Prices(), top_logprobs, votes
         self.spent: Counter[str] = Counter()
         """vlm_calls, vlm_cached, vlm_retries, vlm_input_tokens, vlm_output_tokens and their sum vlm_tokens; vlm_usd
-        where the price is known."""
+        where the price is known; vlm_uncounted, calls without a count of tokens; where there are prices, vlm_unpriced,
+        calls of models without one. The last two are missing where there are none."""
 
     @property
     @abstractmethod
@@ -144,7 +145,11 @@ class Client(ABC):
         tokens = completion.prompt_tokens, completion.completion_tokens
         self.spent.update(vlm_calls=1, vlm_retries=completion.retries, vlm_tokens=sum(tokens))
         self.spent.update(vlm_input_tokens=tokens[0], vlm_output_tokens=tokens[1])
+        if not any(tokens):
+            self.spent["vlm_uncounted"] += 1
         usd = self.prices.compute_cost(self.model, *tokens)
+        if usd is None and self.prices.table:
+            self.spent["vlm_unpriced"] += 1
         if usd is not None:
             self.spent["vlm_usd"] += usd  # type: ignore[assignment]  # money comes in fractions
 

@@ -4,6 +4,7 @@
 from __future__ import annotations
 
 import math
+from dataclasses import replace
 from typing import ClassVar
 
 import numpy as np
@@ -119,6 +120,9 @@ def test_a_success_has_its_price() -> None:
 def test_dollars_are_a_column_where_a_price_is_known() -> None:
     free = Costs("none", 4, 2.0, 20, {}, {"vlm_tokens": 10.0}, {})
     paid = Costs("warp", 4, 2.0, 20, {}, {"vlm_tokens": 10.0, "vlm_usd": 0.05}, {})
+    for missing, shown in (("vlm_uncounted", ["≥2", "≥0.0125"]), ("vlm_unpriced", ["2", "≥0.0125"])):
+        partly = replace(paid, spent={**paid.spent, missing: 1.0})
+        assert partly.cells([("tokens", ""), ("$", "")]) == shown
     assert PRICE_COLUMN not in cost_columns([free]) and PRICE_COLUMN in cost_columns([free, paid])
     assert [line.cells([PRICE_COLUMN]) for line in (free, paid)] == [["–"], ["0.0125"]]
 

@@ -209,6 +209,18 @@ def test_a_question_is_named_by_all_that_its_answer_depends_on() -> None:
     assert ask(MockClient(), IMAGE.copy(), "?", **base).completions[0].call in names
 
 
+def test_calls_that_cannot_be_counted_or_priced_are_told() -> None:
+    known = MockClient(prices=Prices({"mock": (1.0, 2.0)}))
+    ask(known, "?")
+    assert not {"vlm_uncounted", "vlm_unpriced"} & set(known.spent) and known.spent["vlm_usd"] > 0
+    other = MockClient(prices=Prices({"another": (1.0, 2.0)}))
+    ask(other, "?")
+    assert other.spent["vlm_unpriced"] == 1 and "vlm_usd" not in other.spent
+    silent = MockClient(lambda call: Completion("fine"))
+    ask(silent, "?")
+    assert silent.spent["vlm_uncounted"] == 1 and "vlm_unpriced" not in silent.spent
+
+
 def test_the_cache_answers_what_was_of_use(tmp_path: Path) -> None:
     texts = iter(["nonsense", '{"reason": "a", "actions": ["forward"]}', "nonsense", "more"])
     first = MockClient(lambda call: next(texts), cache=ReplyCache(tmp_path), prices=Prices({"mock": (1.0, 2.0)}))
