@@ -94,6 +94,11 @@ def _check_plans(name: str, space: PlanChecker, made: Any, lists: int, count: tu
     if not isinstance(made, Sequence) or len(made) != lists:
         raise ContractError(f"{name}: expected a list of proposals for each of {lists} episodes, got {made!r}")
     for plans in made:
+        if not isinstance(plans, Sequence):
+            raise ContractError(
+                f"{name}: expected a list for each episode, each a list of proposals, such as [[a, b], [c]] for two "
+                f"episodes, got a list of {type(plans).__name__}"
+            )
         if not count[0] <= len(plans) <= count[1]:
             raise ContractError(f"{name}: expected {count[0]} to {count[1]} plans for an episode, got {len(plans)}")
         for plan in plans:
@@ -127,7 +132,10 @@ def check_scores(policy: Policy, scores: Any, proposals: Sequence[Sequence[Propo
     name = f"{type(policy.unwrapped).__name__}.score"
     if not isinstance(scores, Sequence) or len(scores) != len(proposals):
         raise ContractError(f"{name}: expected scores for each of {len(proposals)} episodes, got {scores!r}")
-    found = [np.asarray(row, np.float64) for row in scores]
+    try:
+        found = [np.asarray(row, np.float64) for row in scores]
+    except (TypeError, ValueError):
+        raise ContractError(f"{name}: expected a list of numbers for each episode, got {scores!r}") from None
     for row, plans in zip(found, proposals, strict=True):
         if row.shape != (len(plans),) or not np.isfinite(row).all():
             raise ContractError(f"{name}: expected {len(plans)} finite numbers, one per plan, got {row.tolist()}")
