@@ -7,12 +7,14 @@ import json
 import re
 import subprocess
 import sys
+from pathlib import Path
 
 import pytest
 from fakes import LineAgent, LineTask
 
 from wiw.cli import main
 from wiw.errors import ArgumentError, FileError
+from wiw.report.export import tables
 from wiw.studies.evaluate import run_arms
 
 EVIL = 'a,"b"\n/../c'
@@ -67,6 +69,28 @@ def test_parquet_says_what_the_run_says(log, tmp_path):
         log, lambda name: pandas.read_parquet(tmp_path / "parquet" / f"{name}.parquet").to_dict("records")
     )
     assert [r["executed"].tolist() for r in decisions] == [r["executed"] for r in log.decisions]
+
+
+def test_every_column_is_described(log):
+    """In docs/exported-tables.md; METRIC, STAGE and NAME stand for any."""
+    described = read_described_columns()
+    metrics = sorted({metric for row in log.episodes for metric in row["metrics"]})
+    made = tables(log)
+    assert {"arms", "episodes", "outcomes", "decisions", "candidates"} == set(described) & set(made)
+    for name in set(described) & set(made):
+        named = [re.sub("METRIC|STAGE|NAME", r"\\w+", column) for column in described[name] if column != "METRIC"]
+        for column in {column for row in made[name] for column in row}:
+            assert any(re.fullmatch(pattern, column) for pattern in [*named, *metrics]), f"{name}: {column}"
+
+
+def read_described_columns():
+    """The columns that the page names, by table."""
+    page = (Path(__file__).parents[3] / "docs" / "exported-tables.md").read_text(encoding="utf-8")
+    found = {}
+    for part in page.split("\n## ")[1:]:
+        cells = [line.split("|")[1] for line in part.splitlines() if line.startswith("| `")]
+        found[part.partition("\n")[0]] = [column for cell in cells for column in re.findall("`(.+?)`", cell)]
+    return found
 
 
 def test_rerun_reads_its_recording(log, tmp_path):
