@@ -70,6 +70,12 @@ def find_raising_line(error: BaseException) -> traceback.FrameSummary | None:
     return next(reversed(users or foreign), None)
 
 
+def read_last_line(report: str) -> str:
+    """Return the last line of a traceback, which names the exception; empty for an empty one."""
+    lines = report.strip().splitlines()
+    return lines[-1].strip() if lines else ""
+
+
 class EpisodesError(ArgumentError):
     """A scene has no episode that satisfies the rules asked for; `rule` is the one that the best attempts broke."""
 

@@ -53,13 +53,10 @@ def require_types(where: str, settings: Any) -> None:
     Raises:
         ArgumentError: one has another type; says where, which, and what is expected.
     """
-    kinds = get_type_hints(type(settings))
-    for field in fields(settings):
-        value = getattr(settings, field.name)
+    for name, value in vars(settings).items():
         if isinstance(value, np.generic):
-            value = value.item()
-            object.__setattr__(settings, field.name, value)  # of a frozen one, too
-        _read_value(value, kinds[field.name], f"{where}: {field.name}")
+            object.__setattr__(settings, name, value.item())  # of a frozen one, too
+    read_values(type(settings), vars(settings), where)
 
 
 def require_positive(where: str, settings: object, *names: str) -> None:

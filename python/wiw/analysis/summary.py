@@ -29,7 +29,7 @@ from wiw.analysis.noise_floor import NoiseFloor, find_repeats, measure_noise
 from wiw.analysis.statistics import LEVEL, Difference, Estimate, Units, adjust_p_values, compare, estimate_mean
 from wiw.analysis.stopping import describe_bets, find_units
 from wiw.analysis.utility import CEILING, FLOOR, Utility, utility
-from wiw.errors import RegistryError
+from wiw.errors import RegistryError, read_last_line
 from wiw.metrics.metric import ANSWER_SCORE, SPL, SPL_RULE, SUCCESS, Metric
 from wiw.registry import METRICS
 from wiw.runs.departures import Departure, read_departures
@@ -93,10 +93,10 @@ class ArmSummary:
     @property
     def total(self) -> int:
         """Episodes of the run, scored or not."""
-        return self.done + self.errors + self.pending
+        return self.ended_count + self.pending
 
     @property
-    def ended(self) -> int:
+    def ended_count(self) -> int:
         """Episodes that have ended, scored or with an error."""
         return self.done + self.errors
 
@@ -222,10 +222,10 @@ class Summary:
     def invalid(self) -> tuple[str, ...]:
         """Reasons why the run must not be reported, a sentence per arm; empty for a valid run."""
         return tuple(
-            f"{line.errors} of {line.ended} episodes of {line.name} ended with an infrastructure error "
-            f"({100 * line.errors / line.ended:.1f} %, more than {100 * MAX_ERROR_SHARE:g} %)."
+            f"{line.errors} of {line.ended_count} episodes of {line.name} ended with an infrastructure error "
+            f"({100 * line.errors / line.ended_count:.1f} %, more than {100 * MAX_ERROR_SHARE:g} %)."
             for line in self.arms
-            if line.errors > MAX_ERROR_SHARE * line.ended
+            if line.errors > MAX_ERROR_SHARE * line.ended_count
         )
 
     def __getitem__(self, arm: str) -> ArmSummary:
@@ -472,7 +472,7 @@ def split_outcomes(
 def find_cause(arm: str, outcomes: Sequence[Mapping[str, Any]]) -> str:
     """Return the most frequent last line of an arm's errors, the first of several, and how many errors have it."""
     errors = [row.get("error", "") for row in outcomes if row["arm"] == arm and row["status"] == "error"]
-    messages = [error.strip().splitlines()[-1].strip() if error.strip() else "no message" for error in errors]
+    messages = [read_last_line(error) or "no message" for error in errors]
     if not messages:
         return ""
     message, count = Counter(messages).most_common(1)[0]

@@ -15,6 +15,7 @@ from tyro.conf import Positional, arg
 from wiw.cli.parts import AgentFlags, TaskFlags
 from wiw.cli.stop import stoppable
 from wiw.cli.terminal import printable
+from wiw.errors import read_last_line
 from wiw.loop.config import AgentConfig
 from wiw.runs.config import ResumeConfig, RunConfig
 from wiw.runs.shards import Shard
@@ -195,8 +196,8 @@ def finish(log: Any, report: bool, remark: str = "") -> int:
         count = "1 infrastructure error" if len(errors) == 1 else f"{len(errors)} infrastructure errors"
         print(f"\n{count}, excluded from scores. The first:", file=sys.stderr)
         for first in {episode["arm"]: episode for episode in reversed(errors)}.values():
-            cause = first["error"].strip().splitlines()[-1]
-            print(f"{first['arm']} episode {first['episode']}: {printable(cause)}", file=sys.stderr)
+            cause = printable(read_last_line(first["error"]))
+            print(f"{first['arm']} episode {first['episode']}: {cause}", file=sys.stderr)
         print(f"Once the cause is fixed:  wiw resume {log.path} --retry-errors", file=sys.stderr)
     print(f"\nset-up  {log.store.info.get('preparation_seconds', 0.0):.1f} s to prepare scenes and episodes")
     if log.store.shard is not None:

@@ -22,7 +22,7 @@ from wiw.analysis.data_scaling import (
 )
 from wiw.analysis.statistics import LEVEL
 from wiw.analysis.summary import show_estimate, show_p
-from wiw.report.tables import ROOMY, print_stacked
+from wiw.report.tables import ROOMY, print_stacked, show_count
 
 TITLES: Mapping[str, str] = {
     "error": "error ↓",
@@ -111,7 +111,7 @@ def explain(table: ScalingTable) -> list[str]:
     ]
     lines += _describe_least_p(table)
     lines.append(
-        f"Intervals: 95 %, over scenes and {_count(table.seeds, 'seed')} resampled together; "
+        f"Intervals: 95 %, over scenes and {show_count(table.seeds, 'seed')} resampled together; "
         + ("one seed says nothing about other seeds." if table.seeds == 1 else "so few seeds are a rough guide.")
     )
     return lines
@@ -203,7 +203,7 @@ def _describe_scene_gain(curve: Curve) -> str:
     form = _choose_form(curve.gain.value)
     verdict = "" if curve.is_gain_shown else ": this may be chance"
     seeds = len(curve.by_seed[0])
-    test = "" if curve.gain_p is None else f" (p {show_p(curve.gain_p)} over {_count(seeds, 'seed')}, adjusted)"
+    test = "" if curve.gain_p is None else f" (p {show_p(curve.gain_p)} over {show_count(seeds, 'seed')}, adjusted)"
     few, whole = curve.arm.amounts[0], curve.arm.amounts[-1]
     return (
         f"{curve.arm.model}, {curve.measure}: as many clips from all {whole} scenes instead of {few} gain "
@@ -214,7 +214,3 @@ def _describe_scene_gain(curve: Curve) -> str:
 def count_trainings(curves: Sequence[Curve]) -> int:
     """Return the number of different trainings, each seed counted."""
     return len({name for curve in curves for name in curve.arm.trainings}) * len(curves[0].by_seed[0])
-
-
-def _count(number: int, noun: str) -> str:
-    return f"{number} {noun}" if number == 1 else f"{number} {noun}s"

@@ -14,7 +14,7 @@ from wiw.analysis.statistics import LEVEL, Difference, Estimate
 from wiw.analysis.summary import show_estimate, show_p
 from wiw.experiments.errors.kinds import ERRORS
 from wiw.report.quality_tables import RANK_TITLES, show_rank
-from wiw.report.tables import ROOMY, print_stacked
+from wiw.report.tables import ROOMY, print_stacked, show_count
 
 ABOUT: Mapping[str, str] = {
     "minus oracle": "Paired difference from the same agent with true futures, in points.",
@@ -211,7 +211,7 @@ def _describe_cost(found: Cost, label: str) -> str:
     sure = "" if found.is_shown else ": this may be chance"
     return (
         f"Errors of {found.family} cost {show_estimate(found.loss)} points of {label} per {_name_step(found.measure)} "
-        f"({found.arms} {'arm' if found.arms == 1 else 'arms'}; p {show_p(found.p_adjusted)}, adjusted for all costs)"
+        f"({show_count(found.arms, 'arm')}; p {show_p(found.p_adjusted)}, adjusted for all costs)"
         f"{sure}."
     )
 

@@ -13,7 +13,7 @@ from wiw.analysis.quality import CONTROL, PAPER_QUALITY, QualityTable
 from wiw.analysis.rank_correlation import Correlation
 from wiw.analysis.statistics import Estimate
 from wiw.analysis.summary import show_estimate
-from wiw.report.tables import ROOMY, Column, print_stacked, stack_tables
+from wiw.report.tables import ROOMY, Column, print_stacked, show_count, stack_tables
 
 ABOUT = {
     "SSIM": "Controllability: structural similarity of imagined and true frames, 1 for equal ones.",
@@ -57,10 +57,10 @@ def arm_rows(table: QualityTable) -> tuple[list[str], list[list[str]]]:
 
 def explain(table: QualityTable) -> list[str]:
     """Return what was measured, by whom, and what it does not show."""
-    pictured, episodes = _count(table.pictured, "episode"), _count(table.episodes, "episode")
+    pictured, episodes = show_count(table.pictured, "episode"), show_count(table.episodes, "episode")
     sizes = (
         f"{table.frames} frames of each arm, the same ones, of {pictured} with pictures; {table.outcome} over "
-        f"{episodes} of {_count(table.scenes, 'scene')}, scored in every arm."
+        f"{episodes} of {show_count(table.scenes, 'scene')}, scored in every arm."
     )
     return [sizes, *table.notes, *(_describe(card) for card in table.scorers)]
 
@@ -99,7 +99,3 @@ def _console() -> Console:
 
 def _describe(card: Mapping[str, object]) -> str:
     return f"Scorer {card['scorer']} {card['version']}, licence {card['licence']}."
-
-
-def _count(number: int, noun: str) -> str:
-    return f"{number} {noun}" if number == 1 else f"{number} {noun}s"

@@ -137,6 +137,11 @@ class Column:
         return max(cell_len(line) for cell in (self.title, *self.cells) for line in str(cell).split("\n"))
 
 
+def show_count(number: int, noun: str) -> str:
+    """Return e.g. "1 episode" or "3 episodes"."""
+    return f"{number} {noun}" if number == 1 else f"{number} {noun}s"
+
+
 def stack_tables(
     title: str, names: Sequence[str], columns: Sequence[Column], width: int, heading: str = "arm"
 ) -> list[Table]:

@@ -7,7 +7,7 @@ import math
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from typing import Any, Protocol
 
-from wiw.errors import Error, InfrastructureError, StoreError
+from wiw.errors import Error, InfrastructureError, StoreError, read_last_line
 from wiw.runs.config import EngineConfig
 from wiw.runs.films import film_episodes
 from wiw.runs.pictures import drop_spare_pictures
@@ -294,7 +294,7 @@ class _StoreWriter:
         errors = self._first_errors.setdefault(arm, [])
         if errors is None:
             return
-        errors.append(result.error.strip().splitlines()[-1] if result.error.strip() else "")
+        errors.append(read_last_line(result.error))
         if len(errors) == SAME_ERRORS and len({error.partition(":")[0] for error in errors}) == 1:
             raise InfrastructureError(
                 f"the first {SAME_ERRORS} episodes of arm '{arm}' all ended with the same error, so the run was "

@@ -185,7 +185,7 @@ def test_two_models_five_points_apart_on_each_task(capsys):
     ("arms", "said"), [(1, "its 95 % interval, and"), (4, "its 98.75 % interval, adjusted for 4 arms, and")]
 )
 def test_the_interval_is_named_by_its_confidence(arms, said, capsys):
-    """That of one of four arms excludes 0 where its p, times four, is at most 0.05."""
+    """One of four arms has an interval that excludes 0 where its p, times four, is at most 0.05."""
     plan = wiw.power(20, arms=arms)
     assert said in str(plan) and plan.confidence == pytest.approx(100 - 5 / arms)
     assert main(["power", "--arms", str(arms)]) == 0

@@ -151,7 +151,7 @@ def list_scenes(scenes):
 )
 @pytest.mark.parametrize("rule", ["oracle-none excludes 0", "width(oracle-none)<300"])
 def test_a_look_before_scenes_are_complete_says_so(bound, said, rule):
-    """Of a run of several scenes, the episodes of the first one do not count as units."""
+    """Episodes of the first of several scenes do not count as units."""
     rows = [
         {"arm": arm, "episode": i, "status": "done", "metrics": {"success": float(arm == "oracle")}}
         for arm in ("none", "oracle")
