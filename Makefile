@@ -5,6 +5,7 @@
 BIN := .venv/bin
 TESTS := build/tests
 JOBS ?= $(shell nproc)
+export CXX  # one name for the package's build and that of the C++ tests: ccache compiles what both need once
 
 help:       ## this list
 	@grep -E '^[a-z]+: .*##' $(MAKEFILE_LIST) | sed -E 's/: .*## /\t/' | expand -t 12
