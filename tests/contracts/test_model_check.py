@@ -219,6 +219,16 @@ BROKEN = {
     "memory": (reusing(), {}, "An answer uses the memory of an earlier one"),
     "memory, written to": (rewriting(), {}, "An answer was written to after it was returned"),
     "needs": (dark, {"needs": ("simulator",)}, "needs the simulator, which only the oracle is given"),
+    "needs, vocabulary": (
+        dark,
+        {"control": "action", "vocabulary": {"forward": 0}},
+        "expected a vocabulary with forward, turn_left, turn_right, got one with forward; add turn_left, turn_right",
+    ),
+    "needs, null": (
+        dark,
+        {"control": "action", "vocabulary": {1: 0, 2: 1, 3: 2}, "null_first": True},
+        "expected a vocabulary with null, forward, .*; add null to accepts",
+    ),
     "needs, poses": (dark, {"space": "pose7"}, "gripper poses do not move the camera"),
 }
 

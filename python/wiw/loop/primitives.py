@@ -3,12 +3,13 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterable
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from wiw.action import FORWARD, STOP, TURN_LEFT, TURN_RIGHT
+from wiw.action import FORWARD, NULL, STOP, TURN_LEFT, TURN_RIGHT, Action, parse_action
 from wiw.errors import ArgumentError, ContractError
 from wiw.loop.contract import check_needs, check_plan_space
 from wiw.loop.imagination import Imagination, Request
@@ -39,6 +40,7 @@ class Primitives(PlanSpace):
         accepts, name = model.accepts, type(model.unwrapped).__name__
         check_plan_space(model, PRIMITIVES, self.words)
         check_needs(model)
+        _check_vocabulary(model)
         lacking = [need for need in accepts.needs if need != "history"]  # imagined frames make a history
         if lacking and accepts.frames and longest > accepts.frames - 1:
             raise ArgumentError(
@@ -64,3 +66,25 @@ class Primitives(PlanSpace):
                 f"{type(policy.unwrapped).__name__} needs them; implement its `extend`, or propose with another policy "
                 "and give this one as reviser="
             )
+
+
+def _check_vocabulary(model: WorldModel) -> None:
+    """Check that a model has words of its own for all that plans and their padding are made of.
+
+    Raises:
+        ArgumentError: its vocabulary lacks a primitive.
+    """
+    accepts = model.accepts
+    if accepts.control != "action" or accepts.vocabulary is None:
+        return
+    needed = (*((NULL,) if accepts.null_first else ()), FORWARD, TURN_LEFT, TURN_RIGHT)
+    known = [parse_action(each) for each in accepts.vocabulary]
+    if missing := [each.name.lower() for each in needed if each not in known]:
+        raise ArgumentError(
+            f"{type(model.unwrapped).__name__}: expected a vocabulary with {_list_names(needed)}, got one with "
+            f"{_list_names(known) or 'nothing'}; add {', '.join(missing)} to accepts(vocabulary=...)"
+        )
+
+
+def _list_names(actions: Iterable[Action]) -> str:
+    return ", ".join(each.name.lower() for each in actions)

@@ -137,9 +137,15 @@ def outcome_row(arm: str, result: EpisodeResult) -> OutcomeRow:
     """Return the row of an episode's end.
 
     Raises:
-        ContractError: the environment gives a metric that is no number, a success that is not from 0 to 1, or details
-            that are no mapping.
+        ContractError: the environment gives a metric that is no number, no success or one that is not from 0 to 1, or
+            details that are no mapping.
     """
+    if result.status == "done" and "success" not in result.metrics:
+        raise ContractError(
+            f"arm {arm}, episode {result.episode}: expected the metric 'success', 0 or 1, as every table is about it, "
+            f"got only {', '.join(result.metrics) or 'nothing'}; return it from the environment's `result`, or the "
+            "task's `measure`"
+        )
     success = result.metrics.get("success", 0.0)
     if isinstance(success, int | float | np.number | np.bool_) and not 0 <= success <= 1:
         raise ContractError(

@@ -300,8 +300,9 @@ class _WorkerPool:
         cause = worker.silence.describe() if self._hangs(worker) else _describe_exit(worker.process.exitcode)
         if not worker.ready:
             raise InfrastructureError(
-                f"a worker process could not start ({cause}): the task could not be built there; a script that "
-                "evaluates with workers must do so under `if __name__ == '__main__':`"
+                f"a worker process could not start ({cause}). In a script, call wiw.evaluate under "
+                "`if __name__ == '__main__':`, as each worker imports the script again; otherwise the task or "
+                "the agent could not be built there, and the output above says why"
             )
         if worker.job is None:
             return

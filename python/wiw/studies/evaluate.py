@@ -64,8 +64,9 @@ def evaluate(
             "policy+model" for one with another built-in policy, such as "heuristic+none"; "placebo-shuffled" and
             "placebo-swapped" are placebos of the agent's model (or else of warp), "placebo-blind" is one of a text
             model, "placebo-shuffled:oracle" one of another model. "small=warpnet?weights=small.npz" names an arm and
-            sets options of its model, as on the command line; with a mapping, the keys are the arms' names. None means
-            the agent's own model.
+            sets options of its model, as on the command line; with a mapping, the keys are the arms' names, and else an
+            arm is named as it is written, a path by its class, and a class or instance by its class in lower case. None
+            means the agent's own model.
         more_arms: with `resume`, whether to add arms that the run lacks; the existing ones must be unchanged.
         config: settings of the run.
         settings: settings of `RunConfig` that override the config's, such as seed, out, workers, keep_images, resume,

@@ -290,13 +290,16 @@ class WorldModel(ABC):
     credits: float | None = None
     """Credits that a paid service has charged so far; None if imagining is free."""
 
-    def __init_subclass__(cls, **kwargs: Any) -> None:
-        super().__init_subclass__(**kwargs)
-        if "rollout" in cls.__dict__ and not isinstance(getattr(cls, "accepts", None), Accepts | property):
-            raise ContractError(f"{cls.__name__}: set the class attribute `accepts = wiw.accepts(...)`")
-
     def __new__(cls, *args: Any, **kwargs: Any) -> Self:
-        """Make an instance that knows what a user's class was constructed with."""
+        """Make an instance that knows what a user's class was constructed with.
+
+        Raises:
+            ContractError: the class declares nothing; a class that others derive from need not.
+        """
+        if not isinstance(declared := getattr(cls, "accepts", None), Accepts | property):
+            raise ContractError(
+                f"{cls.__name__}: expected the class attribute `accepts = wiw.accepts(...)`, got {declared!r}"
+            )
         made = super().__new__(cls)
         if not cls.__module__.startswith("wiw."):
             made._constructed_with = _list_arguments(cls, args, kwargs)

@@ -10,11 +10,12 @@ import sys
 from dataclasses import replace
 from importlib.metadata import EntryPoint
 from pathlib import Path
+from typing import Any
 
 import pytest
 
 import wiw
-from wiw.errors import ArgumentError, ConstructionError, Error, RegistryError, find_raising_line
+from wiw.errors import ArgumentError, ConstructionError, ContractError, Error, RegistryError, find_raising_line
 from wiw.registry import METRICS, POLICIES, TASKS, WORLD_MODELS, Registry
 
 MODEL = """
@@ -171,3 +172,27 @@ def test_environments_are_made_as_gymnasium_makes_them(two_rooms: str) -> None:
     assert wiw.make("ImageNav-v0", scenes=two_rooms, render_mode="rgb_array").render_mode == "rgb_array"
     with pytest.raises(ArgumentError, match="expected 'rgb_array'"):
         wiw.make("ImageNav-v0", scenes=two_rooms, render_mode="human")
+
+
+BASE = """
+import numpy as np
+import wiw
+
+
+class Base(wiw.WorldModel):
+    def rollout(self, observations, controls, seeds):
+        return np.repeat(observations.image[:, None], len(controls[0].actions) + 1, 1)
+
+
+class Mine(Base):
+    accepts = wiw.accepts(control="image")
+"""
+
+
+@pytest.mark.parametrize("make", [wiw.world_model, WORLD_MODELS.make_here])
+def test_a_base_of_world_models_needs_no_declaration(tmp_path: Path, make: Any) -> None:
+    file = tmp_path / "mine.py"
+    file.write_text(BASE)
+    assert make(f"{file}:Mine").accepts.control == "image"
+    with pytest.raises(ContractError, match=r"Base: expected the class attribute `accepts = wiw\.accepts\(\.\.\.\)`"):
+        make(f"{file}:Base")

@@ -12,7 +12,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from fakes import LineAgent, LineTask, agent_for
+from fakes import LineAgent, LineEnv, LineTask, agent_for
 from locations import PYTHON_TESTS
 
 import wiw
@@ -143,6 +143,40 @@ def test_a_broken_contract_stops_the_run(tmp_path, workers):
     with pytest.raises(ContractError, match="got float32"):
         run(tmp_path / "run", workers, agent=Sloppy())
     assert not load_run(tmp_path / "run").complete
+
+
+class UnscoredEnv(LineEnv):
+    def result(self):
+        return {name: value for name, value in super().result().items() if name != "success"}
+
+
+@dataclass
+class Unscored(LineTask):
+    """A task that forgets to say which episodes succeed."""
+
+    def environment(self, depth=False):
+        return UnscoredEnv(self)
+
+
+@pytest.mark.parametrize("workers", [1, 2])
+def test_a_task_without_success_stops_the_run(tmp_path, workers):
+    with pytest.raises(
+        ContractError, match=r"expected the metric 'success', .* got only actions, .*; return it from the"
+    ):
+        run(tmp_path / "run", workers, task=Unscored())
+    assert not load_run(tmp_path / "run").episodes
+
+
+def test_a_script_without_a_main_guard_is_told_so(tmp_path):
+    script = tmp_path / "script.py"
+    head = f"import sys\nsys.path.append({str(PYTHON_TESTS)!r})\nimport wiw\nfrom fakes import LineAgent, LineTask\n"
+    call = f"wiw.evaluate(LineTask(), LineAgent(), 2, workers=2, out={str(tmp_path / 'run')!r}, progress=False)\n"
+    script.write_text(head + call)
+    told = subprocess.run([sys.executable, str(script)], check=False, capture_output=True, text=True)
+    assert told.returncode == 1
+    assert "call wiw.evaluate under `if __name__ == '__main__':`" in told.stderr.splitlines()[-1]
+    script.write_text(head + f"if __name__ == '__main__':\n    {call}")
+    assert subprocess.run([sys.executable, str(script)], check=False, capture_output=True).returncode == 0
 
 
 def test_what_cannot_be_pickled_is_refused_with_advice(tmp_path):
