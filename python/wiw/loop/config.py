@@ -51,12 +51,12 @@ class AgentConfig(PlanConfig):
     nested sets of plans. Default: `candidates`."""
 
     def __post_init__(self) -> None:
-        for name in ("candidates", "horizon", "depth", "width", "pool"):
+        for name in ("candidates", "horizon", "depth", "width", "pool", "execute"):
             value = getattr(self, name)
-            if value is not None and not (isinstance(value, Integral) and int(value) >= 1):
+            if not isinstance(value, Integral | None):
+                raise ArgumentError(f"agent: expected {name} as a whole number, got {value!r}")
+            if name != "execute" and value is not None and int(value) < 1:
                 raise ArgumentError(f"agent: expected {name} of at least 1, got {value!r}")
-        if not isinstance(self.execute, Integral | None):
-            raise ArgumentError(f"agent: expected execute as a whole number, got {self.execute!r}")
         if self.execute is not None and self.horizon is not None and self.execute < -self.horizon:
             raise ArgumentError(
                 f"agent: expected execute of at least -horizon, got execute={self.execute}, horizon={self.horizon}"

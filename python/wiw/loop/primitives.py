@@ -75,7 +75,7 @@ def _check_vocabulary(model: WorldModel) -> None:
         ArgumentError: its vocabulary lacks a primitive.
     """
     accepts = model.accepts
-    if accepts.control != "action" or accepts.vocabulary is None:
+    if accepts.control != "action" or not isinstance(accepts.vocabulary, dict):
         return
     needed = (*((NULL,) if accepts.null_first else ()), FORWARD, TURN_LEFT, TURN_RIGHT)
     known = [parse_action(each) for each in accepts.vocabulary]

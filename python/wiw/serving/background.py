@@ -11,6 +11,7 @@ from typing import Any
 
 from wiw.registry import WORLD_MODELS
 from wiw.serving.server import Server, Settings
+from wiw.typed_values import read_values
 
 
 @contextmanager
@@ -21,10 +22,11 @@ def serve_in_background(model: Any, **settings: Any) -> Iterator[Server]:
             model = wiw.world_model(f"remote:{server.address}")
 
     Raises:
-        ArgumentError: the model cannot be served, or a setting is out of range.
+        ArgumentError: the model cannot be served, or a setting is unknown or out of range.
         InfrastructureError: the address cannot be listened at.
     """
-    server = Server(WORLD_MODELS.make_here(model), Settings(**{"port": 0, **settings}))
+    given = read_values(Settings, settings, "serve_in_background", "setting")
+    server = Server(WORLD_MODELS.make_here(model), Settings(**{"port": 0, **given}))
     ready, failures = threading.Event(), list[BaseException]()
     loop = asyncio.new_event_loop()
 

@@ -8,7 +8,7 @@ complete. An interrupted collection can therefore be resumed, and ends with the 
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import asdict, dataclass, replace
+from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
 
@@ -19,11 +19,10 @@ from wiw.datasets import shards
 from wiw.datasets.demonstrations import Demonstrations, read_manifest, shard_paths, shard_range
 from wiw.errors import ArgumentError, FileError
 from wiw.ray_cluster import HERE, Engine
-from wiw.render import resolve_backend
 from wiw.tabletop.tasks import TABLETOP_TASKS
 from wiw.tabletop.workbench import CAMERAS, WRIST
 from wiw.training.jobs import open_folder, run_jobs
-from wiw.training.recording import Collection, record_demonstration
+from wiw.training.recording import Collection, read_collection, record_demonstration
 
 Progress = Callable[[str, int, int, int], None]
 """Called with the task, how many of its demonstrations are done, of how many, and the number of tables failed at."""
@@ -52,13 +51,12 @@ def collect(
     Raises:
         BackendError: the requested renderer does not work here.
         DependencyError: pyarrow is not installed.
-        ArgumentError: an option is out of range, or the folder holds a different collection.
+        ArgumentError: an option is unknown or out of range, or the folder holds a different collection.
         FileError: the folder cannot be written.
         InfrastructureError: an expert fails at one table after another, or a worker process has died.
     """
     shards.require_pyarrow()
-    collection, folder, names = Collection(**asked), Path(out), _parse_tasks(tasks)
-    collection = replace(collection, backend=resolve_backend(collection.backend))
+    collection, folder, names = read_collection(asked), Path(out), _parse_tasks(tasks)
     place.require_valid("collect")
     if workers < 1:
         raise ArgumentError(f"collect: expected 1 worker or more, got {workers}")

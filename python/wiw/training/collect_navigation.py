@@ -11,7 +11,7 @@ from __future__ import annotations
 import json
 import shutil
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from os import PathLike
 from pathlib import Path
 from typing import Any
@@ -37,11 +37,9 @@ from wiw.datasets.worlds import World, world
 from wiw.errors import ArgumentError, BackendError, Error, FileError, InfrastructureError
 from wiw.files import atomic_file
 from wiw.ray_cluster import HERE, Engine
-from wiw.render import resolve_backend
 from wiw.scenes import resolve
 from wiw.training.jobs import open_folder, run_jobs
-from wiw.training.navigation_recording import HFOV_DEG, NavigationCollection, record_segment
-from wiw.training.navigation_rules import make_rules
+from wiw.training.navigation_recording import HFOV_DEG, NavigationCollection, read_collection, record_segment
 from wiw.training.traversal import Traversal, plan_scene
 
 Progress = Callable[[str, int, int, int], None]
@@ -83,14 +81,13 @@ def collect_navigation(
     Raises:
         BackendError: the requested renderer does not work here.
         DependencyError: pyarrow is not installed.
-        ArgumentError: an option is out of range, a scene is of a val or test split, or the folder holds a different
-            collection.
+        ArgumentError: an option is unknown or out of range, a scene is of a val or test split, or the folder holds a
+            different collection.
         FileError: a scene is missing, or the folder cannot be written.
         InfrastructureError: scenes cannot be opened, or a worker process has died.
     """
     require_pyarrow("navigation datasets")
-    options = NavigationCollection(rules=make_rules(preset, rules), **asked)
-    options = replace(options, backend=resolve_backend(options.backend))
+    options = read_collection(preset, rules, asked)
     place.require_valid("collect")
     if workers < 1:
         raise ArgumentError(f"collect: expected 1 worker or more, got {workers}")

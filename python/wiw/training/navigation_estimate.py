@@ -6,18 +6,16 @@ from __future__ import annotations
 import math
 import time
 from collections.abc import Callable, Collection, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 
 from wiw.datasets.worlds import world
 from wiw.nav import NavMesh
-from wiw.render import resolve_backend
 from wiw.scenes import is_generated, open_outline
 from wiw.training.collect_navigation import resolve_train_scenes
-from wiw.training.navigation_recording import NavigationCollection, find_sources, record_segment
-from wiw.training.navigation_rules import make_rules
+from wiw.training.navigation_recording import NavigationCollection, find_sources, read_collection, record_segment
 from wiw.training.traversal import Traversal, plan_scene
 
 PLANNED_SCENES, RECORDED_SCENES = 32, 4
@@ -78,8 +76,7 @@ def estimate_collection(
     Raises:
         Error: as `wiw.collect_navigation`.
     """
-    options = NavigationCollection(rules=make_rules(preset, rules), **asked)
-    options = replace(options, backend=resolve_backend(options.backend))
+    options = read_collection(preset, rules, asked)
     specs = list(resolve_train_scenes(scenes).items())
     chosen = _spread(specs, PLANNED_SCENES)
     recorded = _spread(chosen, RECORDED_SCENES)

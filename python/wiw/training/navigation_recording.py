@@ -3,11 +3,11 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import asdict, dataclass, field
+from dataclasses import asdict, dataclass, field, replace
 from functools import partial
-from typing import Any, Literal, get_args
+from typing import Any, Literal
 
 import numpy as np
 from numpy.typing import NDArray
@@ -16,9 +16,11 @@ from wiw.datasets.cameras import CAMERA_HEIGHT, camera_pose
 from wiw.datasets.navigation_segment import NavigationSegment, encode_color, encode_millimetres
 from wiw.datasets.worlds import World
 from wiw.errors import ArgumentError
+from wiw.render import resolve_backend
 from wiw.training.jobs import count_threads
-from wiw.training.navigation_rules import NavigationRules
+from wiw.training.navigation_rules import NavigationRules, make_rules
 from wiw.training.traversal import HEADINGS, TURN_RAD, Traversal, TraversalSegment
+from wiw.typed_values import read_values
 
 Backend = Literal["auto", "cpu", "gpu"]
 BATCH = 32
@@ -67,8 +69,6 @@ class NavigationCollection:
                 f"collect: expected panoramas whose width is a multiple of {HEADINGS}, so that turns are whole "
                 f"columns, got {size[1]}"
             )
-        if self.backend not in get_args(Backend):
-            raise ArgumentError(f"collect: expected a backend among {', '.join(get_args(Backend))}, got {self.backend}")
 
     @property
     def image_size(self) -> tuple[int, int]:
@@ -78,6 +78,23 @@ class NavigationCollection:
     def describe(self) -> dict[str, Any]:
         """Return the options as JSON values; of equal descriptions are equal datasets."""
         return {**asdict(self), "size": list(self.image_size)}
+
+
+def read_collection(preset: str, rules: Mapping[str, object] | None, given: Mapping[str, Any]) -> NavigationCollection:
+    """Return the options of a dataset, with a renderer that works here.
+
+    Args:
+        preset: of the rules: "default" or "paper".
+        rules: fields of `NavigationRules` to replace.
+        given: other fields of `NavigationCollection`, by name.
+
+    Raises:
+        ArgumentError: an option is unknown, of another type or out of range.
+        BackendError: the requested renderer does not work here.
+    """
+    options = read_values(NavigationCollection, given, "collect", "option")
+    collection = NavigationCollection(rules=make_rules(preset, rules), **options)
+    return replace(collection, backend=resolve_backend(collection.backend))
 
 
 def record_segment(

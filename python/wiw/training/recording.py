@@ -3,9 +3,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
-from dataclasses import dataclass
-from typing import Any, Literal, get_args
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass, replace
+from typing import Any, Literal
 
 import numpy as np
 from numpy.typing import NDArray
@@ -13,9 +13,10 @@ from numpy.typing import NDArray
 from wiw._core import core
 from wiw.datasets.demonstrations import Demonstration, Format, encode_depth, encode_image
 from wiw.errors import ArgumentError, InfrastructureError
-from wiw.render import Output
+from wiw.render import Output, resolve_backend
 from wiw.tabletop.base import TableSetup, TabletopTask
 from wiw.tabletop.workbench import WRIST, Film, Workbench
+from wiw.typed_values import read_values
 from wiw.types import check_seed
 
 Backend = Literal["auto", "cpu", "gpu"]
@@ -62,9 +63,20 @@ class Collection:
             raise ArgumentError(
                 f"collect: expected over {POSES} frames, so that there is one for each action's end, got {self.frames}"
             )
-        for name, given, known in (("format", self.format, Format), ("backend", self.backend, Backend)):
-            if given not in get_args(known):
-                raise ArgumentError(f"collect: expected a {name} among {', '.join(get_args(known))}, got {given}")
+
+
+def read_collection(given: Mapping[str, Any]) -> Collection:
+    """Return the options of a collection, with a renderer that works here.
+
+    Args:
+        given: fields of `Collection`, by name.
+
+    Raises:
+        ArgumentError: an option is unknown, of another type or out of range.
+        BackendError: the requested renderer does not work here.
+    """
+    collection = Collection(**read_values(Collection, given, "collect", "option"))
+    return replace(collection, backend=resolve_backend(collection.backend))
 
 
 def record_demonstration(task: TabletopTask, episode: int, collection: Collection) -> tuple[Demonstration, int]:

@@ -330,12 +330,14 @@ def test_the_command_line(tmp_path: Path, capsys: pytest.CaptureFixture[str]) ->
         ({"seed": 2**64}, r"seed: expected a whole number from 0 to 2\*\*64 - 1"),
         ({"size": 8}, "16 to 4096"),
         ({"frames": 15}, "over 15 frames"),
-        ({"format": "webp"}, "among jpeg, png, got webp"),
-        ({"backend": "metal"}, "backend among auto, cpu, gpu, got metal"),
+        ({"format": "webp"}, "format: expected one of jpeg, png, got 'webp'"),
+        ({"backend": "metal"}, "backend: expected one of auto, cpu, gpu, got 'metal'"),
         ({"workers": 0}, "1 worker or more"),
         ({"tasks": "juggle"}, "push_buttons, slide_block, insert_peg, stack_cups, got juggle"),
         ({"tasks": ["slide_block"] * 2}, "different ones"),
         ({"tasks": []}, "tasks as all"),
+        ({"episode": 1}, r"unknown option 'episode'; .*Did you mean episodes\?"),
+        ({"episodes": "1"}, "episodes: expected a whole number, got '1'"),
     ],
 )
 def test_what_cannot_be_collected_is_refused(tmp_path: Path, asked: dict[str, Any], words: str) -> None:

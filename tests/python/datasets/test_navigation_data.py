@@ -442,10 +442,12 @@ def test_files_below_a_folder_of_evaluation_are_refused(tmp_path: Path, two_room
         ({"height": 9.0}, "camera height from 0.1 to 3"),
         ({"size": (36, 60)}, "multiple of 16"),
         ({"size": (8, 64)}, "16 to 8192"),
-        ({"backend": "metal"}, "auto, cpu, gpu, got metal"),
+        ({"backend": "metal"}, "backend: expected one of auto, cpu, gpu, got 'metal'"),
         ({"workers": 0}, "1 worker or more"),
         ({"preset": "huge"}, "default, paper, got huge"),
         ({"rules": {"spacing": -1.0}}, "spacing above 0"),
+        ({"pass": 2}, r"unknown option 'pass'; .*Did you mean passes"),
+        ({"passes": "2"}, "passes: expected a whole number, got '2'"),
     ],
 )
 def test_what_cannot_be_collected_is_refused(tmp_path: Path, two_rooms: str, asked: dict[str, Any], words: str) -> None:

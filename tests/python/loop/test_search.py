@@ -231,6 +231,8 @@ def test_what_cannot_be_searched_deeper_says_so() -> None:
     for name in ("depth", "width"):
         with pytest.raises(ArgumentError, match=f"expected {name} of at least 1, got 0"):
             wiw.Agent(Wanderer(), "copy", **{name: 0})
+        with pytest.raises(ArgumentError, match=f"expected {name} as a whole number, got '3'"):
+            wiw.Agent(Wanderer(), "copy", **{name: "3"})
     assert wiw.Agent(Wanderer(), depth=2).decide_batch([query(0, 9)])[0].rollouts is None  # nothing is imagined
     with pytest.raises(ArgumentError, match="needs depth"):
         wiw.Agent(Wanderer(), model_of(frames=3, needs=("depth",)), candidates=3, horizon=4, depth=2)

@@ -560,6 +560,14 @@ def test_settings_out_of_range(wrong):
         Settings(**wrong)
 
 
+def test_a_misspelt_setting_has_a_hint():
+    with (
+        pytest.raises(ArgumentError, match=r"unknown setting 'windw'; .*Did you mean window\?"),
+        serve_in_background(Plain(), windw=0.1),
+    ):
+        pass
+
+
 def test_the_token_opens_and_no_other(monkeypatch):
     with serve_in_background(Plain(), token="secret") as server:
         for token in (None, "", "Secret", "secret2", "é"):
