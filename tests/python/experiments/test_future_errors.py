@@ -58,7 +58,7 @@ def env(two_rooms: str):
     return made
 
 
-def imagine(env, error=None, plans=(AHEAD,), model=None, decision=0, view="panorama"):
+def imagine(env, error=None, plans=(AHEAD,), model=None, decision=0, view="panorama", ends=False):
     """The rollouts of an episode's plans, at a small size, and what goes with them."""
     model = model or Oracle(SIZE)
     error = make_error(error) if isinstance(error, str) else error
@@ -67,13 +67,13 @@ def imagine(env, error=None, plans=(AHEAD,), model=None, decision=0, view="panor
     environments.add(key, env)
     imaginer.grant(environments)
     request = Request(
-        plan_space(PRIMITIVES),
+        plan_space(model.accepts.space),
         [key],
         [env.observation],
         [ModelInput(env.observation)],
         [list(plans)],
         [range(len(plans))],
-        FrameSpec(view, SIZE),
+        FrameSpec(view, SIZE, ends=ends),
         Clock(),
     )
     return imaginer.imagine(request)
@@ -291,11 +291,16 @@ def test_copies_are_pasted_behind_what_is_nearer() -> None:
 
 
 @pytest.fixture(scope="module")
-def bench():
+def table():
     task = Manipulation("stack_cups")
     env = task.environment()
     env.begin(task.episode(0))
-    return env.fork()
+    return env
+
+
+@pytest.fixture(scope="module")
+def bench(table):
+    return table.fork()
 
 
 def test_frames_of_a_changed_world_need_not_look_like_the_observation(env) -> None:
@@ -353,6 +358,16 @@ def test_errors_at_a_table(bench) -> None:
     views = {error: drawn.fork().render_fronts_after(here[None], (48, 48)) for error, drawn in benches.items()}
     np.testing.assert_array_equal(views[""], views["missing@0"])
     assert all(not np.array_equal(views[""], views[error]) for error in ("missing@1", "moved@0.1", "invented@1"))
+
+
+@pytest.mark.parametrize("error", ["flicker@60", "direction@90", "ignored@0.5", "lag@1", "missing@0.5", "moved@0.1"])
+def test_at_a_table_where_only_ends_are_read_nothing_else_is_drawn(table, error: str) -> None:
+    plans = [Proposal(table.fork().pose + np.outer([1, 2, 3], [0, side, 0, 0, 0, 0, 0])) for side in (0.01, -0.02)]
+    how = {"plans": plans, "model": make_oracle(GRIPPER_POSES, SIZE), "view": "front"}
+    whole, ends = (imagine(table, error, ends=ends, **how) for ends in (False, True))
+    for one, other in zip(ends.rollouts[0], whole.rollouts[0], strict=True):
+        np.testing.assert_array_equal(one.frames, other.frames[-1:])
+    assert [found.costs[0]["frames"] for found in (whole, ends)] == [6, 2]
 
 
 def test_an_arm_names_error_dose_and_model() -> None:

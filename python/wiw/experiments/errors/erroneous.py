@@ -33,9 +33,15 @@ class ErroneousModel(ModelWrapper):
 
     @property
     def accepts(self) -> Accepts:  # type: ignore[override]
-        """The model's declaration, with seeds; if something is drawn once per future, futures share no frames."""
+        """The model's declaration, with seeds.
+
+        If something is drawn once per future, plans of primitives share no frames; those of poses never do.
+        """
         own = self.model.accepts
-        return replace(own, seeded=True, causal=own.causal and not self.error.draws_future) if self.error.dose else own
+        if not self.error.dose:
+            return own
+        keeps = own.space != PRIMITIVES or not self.error.draws_future
+        return replace(own, seeded=True, causal=own.causal and keeps)
 
     def describe(self) -> dict[str, Any]:
         """Describe the model and the error."""
