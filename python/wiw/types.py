@@ -234,6 +234,7 @@ class Goal:
     """What the task asks of the agent. `image` is set for image goals, `text` for questions and instructions."""
 
     task: str
+    """The built-in task that it is a goal of; for a task derived from one, that one's name, which prompts go by."""
     image: NDArray[np.uint8] | None = None
     """uint8 [480, 480, 3], HFOV 90 degrees."""
     text: str | None = None

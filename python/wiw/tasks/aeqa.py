@@ -211,7 +211,7 @@ class AEQA(NavigationTask):
 
     def make_goal(self, place: World, episode: Episode) -> Goal:
         """Return the question's text, nothing else of it, and the budget."""
-        return Goal(self.name, text=read_question(episode).text, question=True, budget=self.budget)
+        return Goal(AEQA.name, text=read_question(episode).text, question=True, budget=self.budget)
 
     def find_goal_position(self, place: World, episode: Episode) -> NDArray[np.float64]:
         """Return the viewpoint that is nearest to the start; the start itself where none is known."""

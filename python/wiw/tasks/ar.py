@@ -108,7 +108,7 @@ class AR(NavigationTask):
 
     def make_goal(self, place: World, episode: Episode) -> Goal:
         """Return the choices; what is to be recognised is pointed out in the observations."""
-        return Goal(self.name, choices=self.choices)
+        return Goal(AR.name, choices=self.choices)
 
     def find_goal_position(self, place: World, episode: Episode) -> NDArray[np.float64]:
         """Return the place nearest to the target's centre where an agent can stand; below the centre without one."""

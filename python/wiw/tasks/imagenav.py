@@ -79,10 +79,10 @@ class ImageNav(NavigationTask):
             FileError: there is a picture, and it cannot be read.
         """
         if "goal_image" in episode.info:
-            return Goal(self.name, image=read_goal_image(Path(episode.info["goal_image"])))
+            return Goal(ImageNav.name, image=read_goal_image(Path(episode.info["goal_image"])))
         pose = camera_pose(np.asarray(place.ground.put_down(episode.goal_position), float), episode.goal_yaw)
         image = place.renderer.perspective(pose[None], GOAL_SIZE, GOAL_HFOV, outputs=("color",))["color"][0]
-        return Goal(self.name, image=image)
+        return Goal(ImageNav.name, image=image)
 
     def find_goal_position(self, place: World, episode: Episode) -> NDArray[np.float64]:
         """Return the goal's position, on the floor that is drawn."""

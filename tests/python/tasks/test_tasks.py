@@ -173,6 +173,15 @@ def test_the_example_of_a_variant_runs_under_the_presets_of_what_it_derives_from
         TASKS.make(name, preset="offical")
 
 
+def test_a_variant_is_asked_with_the_prompts_of_what_it_derives_from(two_rooms: str, tmp_path: Path) -> None:
+    pytest.importorskip("pydantic")
+    name, policy = f"{EXAMPLES / 'patient_imagenav.py'}:PatientImageNav", wiw.policy("vlm", vlm="mock", task="imagenav")
+    how: Any = {"scenes": two_rooms, "decisions": 1, "out": tmp_path / "run", "progress": False}
+    log = wiw.evaluate(name, wiw.Agent(policy, "copy"), 1, **how)
+    assert [row["status"] for row in log.episodes] == ["done"]
+    assert log.store.config["task"]["task"] == "patient-imagenav"
+
+
 def test_a_task_with_rules_of_its_own_needs_no_preset(two_rooms: str, tmp_path: Path) -> None:
     @dataclass(frozen=True)
     class Rules:
