@@ -150,6 +150,8 @@ class Summary:
     """Trackers of targets in imagined frames by name, each with "frames" or "poses", whichever it followed."""
     answers: Mapping[str, Mapping[str, int]] = field(default_factory=dict, kw_only=True)
     """Answers of a language model by arm and by the kind of problem for which they could not be used ("": none)."""
+    choices: Mapping[str, tuple[int, int]] = field(default_factory=dict, kw_only=True)
+    """Choices of a language model by arm: how many are doubtful (`wiw.vlm.messages.Reply.doubtful`), and how many."""
     looks: str = field(default="", kw_only=True)
     """Sentences on the rule by which the run was to stop early, and on whether it did; empty without one."""
     bets: str = field(default="", kw_only=True)
@@ -202,6 +204,7 @@ class Summary:
             if follows in TRACKED
         ]
         found += [_describe_unusable(arm, kinds) for arm, kinds in self.answers.items() if any(kinds)]
+        found += [_describe_doubtful(arm, *counts) for arm, counts in self.choices.items() if counts[0]]
         if self.unbalanced:
             found.append(
                 f"Unbalanced questions in {self.unbalanced} of the episodes: each is asked in one scene only, so its "
@@ -314,12 +317,13 @@ def summarise_run(run: Run) -> Summary:
         units=units,
     )
     tiers = _summarise_tiers(run, outcomes, agents, units)
-    answers = run.store.count_answers()
+    answers, choices = run.store.count_answers(), run.store.count_choices()
     return replace(
         found,
         unbalanced=count_unbalanced(run),
         trackers=_list_trackers(run),
         answers={arm: answers[arm] for arm in run.arms if arm in answers},
+        choices={arm: choices[arm] for arm in run.arms if arm in choices},
         departures=read_departures(run.store.info),
         looks=_describe_looks(run.store.info),
         bets="" if units is None else describe_bets(episodes, units),
@@ -364,6 +368,14 @@ def _describe_unusable(arm: str, kinds: Mapping[str, int]) -> str:
     return (
         f"{arm}: {unusable} of {asked} answers of its language model ({100 * unusable / asked:.0f} %) could not be "
         f"used ({reasons}). Fallbacks, such as a randomly drawn primitive, were used instead and are scored."
+    )
+
+
+def _describe_doubtful(arm: str, doubtful: int, count: int) -> str:
+    """Return how many choices rest on less than half of the model's probability."""
+    return (
+        f"{arm}: in {doubtful} of {count} choices of its language model ({100 * doubtful / count:.0f} %), most of the "
+        "probability went to something other than the choices, so these say little about what it prefers."
     )
 
 

@@ -484,6 +484,18 @@ class RunStore:
             found.setdefault(row["arm"], {})[row["trouble"] or ""] = row["n"]
         return found
 
+    def count_choices(self) -> dict[str, tuple[int, int]]:
+        """Return by arm how many choices of a language model in ended episodes are doubtful, and how many there are.
+
+        An arm without any is left out.
+        """
+        rows = self._rows(
+            "SELECT arm, sum(json_extract(e.value, '$.result.doubtful')) AS doubtful, count(*) AS n "
+            "FROM decision d JOIN outcome USING (arm, episode), json_each(d.exchanges) e "
+            "WHERE json_extract(e.value, '$.result.mass') IS NOT NULL GROUP BY arm"
+        )
+        return {row["arm"]: (row["doubtful"] or 0, row["n"]) for row in rows}
+
     def sum_lost_costs(self) -> dict[str, dict[str, float]]:
         """Return by arm and name what was spent on decisions that an error interrupted."""
         found: dict[str, dict[str, float]] = {}

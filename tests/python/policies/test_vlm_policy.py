@@ -19,7 +19,7 @@ pytest.importorskip("json_repair")
 
 import wiw
 from misbehaviour import MisbehavingVlmServer, Misbehaviour
-from recognition_file import a_file
+from recognition_file import CHOICES, a_file
 from wiw.cli import main
 from wiw.errors import ArgumentError, PromptError, VlmError
 from wiw.loop.memory import Query
@@ -335,6 +335,20 @@ def test_a_summary_says_how_many_answers_could_not_be_used(two_rooms: str, tmp_p
     assert half.answers == {"none": {"": 1, "refusal": 1}}
     assert "none: 1 of 2 answers of its language model (50 %) could not be used (refusal 1)." in str(half.remarks())
     assert not run("whole", WALK, WALK).remarks()
+
+
+def test_a_summary_says_how_many_choices_are_doubtful(two_rooms: str, tmp_path: Path) -> None:
+    shares = iter([0.2, 0.9])
+
+    def answer(call: Call) -> Any:
+        return {call.labels[0]: next(shares, 0.9)} if len(call.labels) == len(CHOICES) else script(call)
+
+    policy = VLM(MockClient(answer))
+    task = wiw.make("AR-v0", episode_file=a_file(tmp_path, two_rooms), decisions=2)
+    found = evaluate(task, wiw.Agent(policy, execute=1), 1, out=tmp_path / "run", progress=False).numbers()
+    doubtful, count = found.choices["none"]
+    assert doubtful == 1 and count >= 2
+    assert f"none: in 1 of {count} choices of its language model" in str(found.remarks())
 
 
 def test_a_primitive_that_no_plan_begins_with_is_a_plan_of_its_own(recognition: Any) -> None:
