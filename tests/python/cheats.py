@@ -41,6 +41,17 @@ def invert_seeds(seeds, run_seed, episodes=50, decisions=20, candidates=8):
     return [known[int(seed)] for seed in seeds if int(seed) in known]
 
 
+def find_episodes_by_odometry(task, episodes, plan, seen):
+    """Return the numbers of the episodes in which a plan leads to the odometry that was seen, to the last byte."""
+    env = task.environment()
+    found = []
+    for number, episode in enumerate(episodes):
+        env.begin(episode)
+        if all(env.run(plan[[k]]).observation.odometry.tobytes() == after.tobytes() for k, after in enumerate(seen)):
+            found.append(number)
+    return found
+
+
 class EpisodeRegenerator(wiw.Policy):
     """Makes the episode again from its key and the command line, and walks its own copy of the agent to the goal."""
 

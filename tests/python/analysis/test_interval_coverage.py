@@ -46,7 +46,7 @@ def test_with_many_scenes_the_average_is_what_is_claimed(design, correlation):
         (s, [1.0, -1.0, 0.0], "difference") for s in PAIRS.values()
     ]
     mean = np.mean([measure_coverage(s, v, k, DESIGNS[design], correlation, 20_000)[0] for s, v, k in cells])
-    assert 93.5 < mean < 97.0
+    assert 93.5 < mean < 97.0  # 96.5 was the aim; 30 scenes without correlation reach 96.6
 
 
 @pytest.mark.parametrize(("design", "correlation"), [("5 x 10", 0.3), ("10 x 5", 0.1), ("40 + 9 x 1", 0.3)])

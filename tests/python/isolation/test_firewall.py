@@ -8,11 +8,11 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from cheats import LiveEnvironmentFinder, invert_seeds
+from cheats import LiveEnvironmentFinder, find_episodes_by_odometry, invert_seeds
 from locations import PYTHON_TESTS
 
 import wiw
-from wiw.action import FORWARD, TURN_LEFT
+from wiw.action import FORWARD, TURN_LEFT, TURN_RIGHT
 from wiw.cli import main
 from wiw.errors import ArgumentError, StoreError
 from wiw.loop.keys import draw_salt, make_key
@@ -21,6 +21,7 @@ from wiw.runs.recipes import AgentRecipe, TaskRecipe
 from wiw.studies.compare import compare
 from wiw.studies.evaluate import evaluate, resume_run
 from wiw.studies.run_log import load_run
+from wiw.tasks.imagenav import ImageNav
 from wiw.types import Conditioning, Control, Episode, Key, Proposal
 from wiw.world_models.oracle import Oracle
 
@@ -123,6 +124,20 @@ def test_odometry_does_not_tell_where_it_begins(two_rooms: str) -> None:
         seen.append([env.run(np.array([action])).observation.odometry.tobytes() for action in PLAN])
     assert seen[0] == seen[1] == seen[2]
     env.close()
+
+
+@pytest.mark.parametrize("rounded", [True, False])
+def test_which_of_known_episodes_it_is_does_not_show_in_odometry(two_rooms: str, monkeypatch, rounded: bool) -> None:
+    if not rounded:
+        monkeypatch.setattr("wiw.envs.episode_state.round_odometry", np.copy)
+    task, plan = ImageNav(scenes=two_rooms), np.array([TURN_LEFT, FORWARD, TURN_RIGHT, TURN_RIGHT, FORWARD], np.int8)
+    known = task.episodes(12)
+    env = task.environment()
+    env.begin(known[3])
+    seen = [env.run(plan[[k]]).observation.odometry for k in range(len(plan))]
+    assert all(np.linalg.norm(seen[k][:2] - seen[k - 1][:2]) > 0.19 for k in (1, 4)), "a step was refused"
+    matching = find_episodes_by_odometry(task, known, plan, seen)
+    assert len(matching) > 9 if rounded else matching == [3]
 
 
 def test_keys_name_episodes_and_tell_nothing() -> None:

@@ -27,7 +27,8 @@ from wiw.report.error_tables import (
     list_titles,
     print_errors,
 )
-from wiw.studies.errors import ErrorSettings, make_recipes, read_errors, study_errors
+from wiw.studies.errors import SMALL, ErrorSettings, make_recipes, read_errors, study_errors
+from wiw.types import PRIMITIVES
 
 ARMS = {"error-blur@64": ("blur", 64.0), "error-lag@2": ("lag", 2.0), "error-lag@4": ("lag", 4.0)}
 DISTANCE = {"error-blur@64": 0.5, "error-lag@2": 0.2, "error-lag@4": 0.4}
@@ -58,6 +59,14 @@ def decisions() -> list[dict]:
         rows += [{"arm": arm, "episode": index, "fidelity": measured} for index in range(EPISODES)]
         rows += [{"arm": arm, "episode": 0, "fidelity": None}]
     return rows
+
+
+def test_the_small_version_is_as_small_as_it_says() -> None:
+    (task,) = SMALL.tasks
+    assert task == "imagenav" and SMALL.episodes == 8
+    assert sorted(SMALL.list_arms(task)) == sorted(
+        f"error-{kind}@{dose:g}" for kind in SMALL.kinds for dose in ERRORS[kind].doses[PRIMITIVES][-2:]
+    )
 
 
 @pytest.fixture(scope="module")

@@ -227,11 +227,22 @@ def test_the_study_of_language_models_asks_each_server_for_its_part(tmp_path: Pa
     from wiw.serving.vlm_server import VlmServer
     from wiw.vlm.mock import MockClient
 
-    with VlmServer(MockClient(model="a")) as first, VlmServer(MockClient(model="b")) as second:
+    own = tmp_path / "prompts/ar/answerer.j2"
+    own.parent.mkdir(parents=True)
+    own.write_text("Which of these is it?")
+    calls: list[str] = []
+
+    def answer(call: Any) -> Any:
+        calls.append(str(call.messages))
+        return dict.fromkeys(call.labels, 1 / len(call.labels)) if call.schema is None else "?"
+
+    with VlmServer(MockClient(answer, model="a")) as first, VlmServer(MockClient(answer, model="b")) as second:
         names = {"server": first.url, "other_server": second.url, "model": "a", "other": "b", "task": "ar"}
-        found = wiw.study("vlm", out=tmp_path, small=True, variables={**names, "world_model": "copy"}, progress=False)
+        more = {"world_model": "copy", "imported": str(own.parents[1])}
+        found = wiw.study("vlm", out=tmp_path / "out", small=True, variables={**names, **more}, progress=False)
     (part,) = found.parts
-    assert len(part.numbers.arms) == 9 and not found.invalid
+    assert len(part.numbers.arms) == 10 and not found.invalid
+    assert any(own.read_text() in each for each in calls)
     asked: dict[str, set[str]] = {}
     for row in part.log.decisions:
         for exchange in row["exchanges"]:

@@ -16,7 +16,8 @@ from wiw.errors import ArgumentError
 
 torch = pytest.importorskip("torch", reason="needs wiw[torch]")
 
-from wiw.policies.navigator.policy import Navigator  # noqa: E402
+from wiw.policies.navigator.policy import WEIGHTS, Navigator  # noqa: E402
+from wiw.policies.navigator.weights import load  # noqa: E402
 from wiw.training.checkpoint import Checkpoint  # noqa: E402
 from wiw.training.goal_places import GoalPlaces, PlaceRules, record_goal_places, require_places  # noqa: E402
 from wiw.training.navigator import Recipe, evaluate, measure_prior, sample_pairs, spread_bearings, train  # noqa: E402
@@ -118,6 +119,14 @@ def test_the_network_learns_and_is_measured_beside_the_similarity(places: GoalPl
     assert sum(row["pairs"] for row in found["bearing"].values()) <= 40
     for row in found["bearing"].values():
         assert row["pairs"] == 0 or 0 <= row["network"] <= 180
+
+
+def test_the_shipped_network_knows_nearness_in_a_house_by_other_hands(data_dir: Path) -> None:
+    network, card = load(WEIGHTS)
+    house = record_goal_places(world(str(data_dir / "small_house" / "worlds" / "small_house.world"), "cpu"), 0)
+    found = evaluate(network, card, [house], 0, 600)
+    assert found["pairs"] == 600
+    assert found["auc"]["network"] >= 0.85  # of "within 2 m"; docs/navigation-tasks.md has all figures
 
 
 def test_scenes_without_ways_are_left_out_and_what_cannot_be_measured_is_none(places: GoalPlaces) -> None:
