@@ -230,19 +230,13 @@ def test_the_study_of_language_models_asks_each_server_for_its_part(tmp_path: Pa
     own = tmp_path / "prompts/ar/answerer.j2"
     own.parent.mkdir(parents=True)
     own.write_text("Which of these is it?")
-    calls: list[str] = []
-
-    def answer(call: Any) -> Any:
-        calls.append(str(call.messages))
-        return dict.fromkeys(call.labels, 1 / len(call.labels)) if call.schema is None else "?"
-
-    with VlmServer(MockClient(answer, model="a")) as first, VlmServer(MockClient(answer, model="b")) as second:
+    with VlmServer(MockClient(model="a")) as first, VlmServer(MockClient(model="b")) as second:
         names = {"server": first.url, "other_server": second.url, "model": "a", "other": "b", "task": "ar"}
         more = {"world_model": "copy", "imported": str(own.parents[1])}
         found = wiw.study("vlm", out=tmp_path / "out", small=True, variables={**names, **more}, progress=False)
     (part,) = found.parts
     assert len(part.numbers.arms) == 10 and not found.invalid
-    assert any(own.read_text() in each for each in calls)
+    assert any(own.read_text() in str(call.messages) for call in first.client.calls)
     asked: dict[str, set[str]] = {}
     for row in part.log.decisions:
         for exchange in row["exchanges"]:
