@@ -4,6 +4,7 @@
 from __future__ import annotations
 
 import errno
+import io
 import logging
 import pickle
 import threading
@@ -194,6 +195,38 @@ def test_where_nothing_can_be_written_the_run_goes_on_and_says_so_once(tmp_path,
     with caplog.at_level(logging.WARNING, "wiw.rollouts"):
         assert imagine_rows(ask, *question(FF))[1] == 1 and imagine_rows(ask, *question(FF, image=9))[1] == 1
     assert caplog.text.count("no longer cached") == 1
+
+
+class HalfWritten(io.FileIO):
+    """A file on a disk that is full after half of the first write."""
+
+    def write(self, data):
+        if self.tell():
+            raise OSError(errno.ENOSPC, "No space left on device")
+        return super().write(memoryview(data)[: len(data) // 2])
+
+
+@pytest.mark.parametrize("buffer", [16, 8192], ids=["while it is written", "when it is closed"])
+def test_a_disk_that_fills_up_within_an_entry_costs_the_cache_and_leaves_no_draft(
+    tmp_path, caplog, monkeypatch, buffer
+) -> None:
+    opened, drafts = Path.open, []
+
+    def open_half(path, mode="r", **options):
+        if path.suffix != ".draft":
+            return opened(path, mode, **options)
+        drafts.append(path)
+        return io.BufferedWriter(HalfWritten(path, "w"), buffer)
+
+    ask = make(tmp_path)
+    with monkeypatch.context() as patched, caplog.at_level(logging.WARNING, "wiw.rollouts"):
+        patched.setattr(Path, "open", open_half)
+        for image in (0, 9):
+            frames, rows = imagine_rows(ask, *question(FF, image=image))
+            assert rows == 1 and (frames[:, 0] == image).all()
+    assert len(drafts) == 1 and not [path for path in tmp_path.rglob("*") if path.is_file()]
+    assert caplog.text.count("no longer cached: [Errno 28] No space left on device") == 1
+    assert [imagine_rows(make(tmp_path), *question(FF))[1] for _ in range(2)] == [1, 0]
 
 
 def test_a_file_system_without_locks_costs_the_cache_and_no_rollout(tmp_path, caplog, monkeypatch) -> None:
