@@ -18,6 +18,8 @@ from wiw.errors import ArgumentError, WeightsError
 from wiw.files import atomic_file
 
 N = TypeVar("N", bound=nn.Module)
+_UNFIT = (OSError, SafetensorError, ArgumentError, KeyError, TypeError, ValueError, OverflowError, RuntimeError)
+"""Errors that a damaged file leads to."""
 
 
 @dataclass(frozen=True)
@@ -58,7 +60,7 @@ class WeightFile(Generic[N]):
             network = self.build(header)
             network.load_state_dict({name: value.float() for name, value in values.items()})
             return network.eval(), dict(header["card"])
-        except (OSError, SafetensorError, ArgumentError, KeyError, TypeError, ValueError, RuntimeError) as error:
+        except _UNFIT as error:
             raise WeightsError(
                 f"{path}: expected complete weights of {self.name}: {error}; {self.cure}", "unfit"
             ) from error

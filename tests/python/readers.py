@@ -15,12 +15,15 @@ import struct
 from collections.abc import Callable
 from contextlib import closing, suppress
 from dataclasses import dataclass
+from functools import cache
 from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import Any
+from unittest.mock import patch
 
 import msgpack
 import numpy as np
+from jinja2 import TemplateSyntaxError
 
 import wiw
 from wiw import _core
@@ -89,6 +92,19 @@ def damage_glb(data: bytes, draw: random.Random) -> bytes:
     return struct.pack("<4sII", b"glTF", 2, 12 + len(chunks)) + chunks
 
 
+def damage_safetensors(data: bytes, draw: random.Random) -> bytes:
+    """Change a value of the header, or of the card and the sizes in it; tensors stay where they are."""
+    (length,) = struct.unpack_from("<Q", data)
+    header = json.loads(data[8 : 8 + length])
+    metadata = header["__metadata__"]
+    if draw.random() < 0.5:
+        metadata["header"] = damage_json(metadata["header"].encode(), draw).decode()
+        document = json.dumps(header).encode()
+    else:
+        document = damage_json(json.dumps(header).encode(), draw)
+    return struct.pack("<Q", len(document)) + document + data[8 + length :]
+
+
 def damage_sqlite(data: bytes, draw: random.Random) -> bytes:
     """Change the values of a column, the text of a table's schema, or the number of the schema."""
     with TemporaryDirectory() as folder:
@@ -137,6 +153,7 @@ STRUCTURES: dict[str, Mutate] = {
     "yaml": damage_yaml,
     "msgpack": damage_msgpack,
     "glb": damage_glb,
+    "safetensors": damage_safetensors,
     "sqlite": damage_sqlite,
 }
 
@@ -279,6 +296,21 @@ def read_recipe(path: Path) -> Any:
     return load_recipe("pocket", path)
 
 
+def make_scene_instance(path: Path) -> None:
+    from scan_files import write_scene_dataset
+
+    written = write_scene_dataset(path.parent)
+    shutil.copy(written, path)
+
+
+def read_scene_instance(data: bytes, folder: Path) -> Any:
+    from wiw.scenes.scans import scene_dataset
+
+    path = folder / "scenes/home.scene_instance.json"
+    path.write_bytes(data)
+    return scene_dataset.read(path, {}).scene.describe()
+
+
 def make_rollout(path: Path) -> None:
     from wiw.loop.rollout_cache import RolloutCache
 
@@ -294,6 +326,54 @@ def read_rollout(data: bytes, folder: Path) -> Any:
     path.parent.mkdir(exist_ok=True)
     path.write_bytes(data)
     return RolloutCache(folder).get("ab" + "0" * 30, 0, np.empty((2, 4, 4, 3), np.uint8))
+
+
+TEMPLATE = b"""You see its {{ obs_key }}.{# a remark #}
+{% for name, meaning in actions.items() if plan_num > 0 %}
+- {{ name | upper }}: {{ meaning }}
+{% endfor %}
+{% set braces %}{% raw %}{{ }}{% endraw %}{% endset %}
+{% if captions and shown == "strip" %}
+Give {{ look_ahead_action_num * 2 }} of {{ [1, 2.5, "three"][:2] | join(", ") }}.
+{% else %}
+{{ braces ~ centred }}
+{% endif %}
+"""
+
+
+def read_prompts(data: bytes, folder: Path) -> Any:
+    """Read a folder with one template, which is parsed here too: no fuzzer sees the process that fills it."""
+    from wiw.policies.vlm.prompts import templates
+    from wiw.vlm.template_worker import ENVIRONMENT
+
+    path = folder / "imagenav" / "planner.j2"
+    path.parent.mkdir(exist_ok=True)
+    path.write_bytes(data)
+    with suppress(UnicodeDecodeError, TemplateSyntaxError, RecursionError):  # Prompts says what is wrong
+        ENVIRONMENT.parse(data.decode())
+    with patch.object(templates, "TemplateFiller", start_filler):
+        return templates.Prompts(folder).digest
+
+
+@cache
+def start_filler() -> Any:
+    """Return one process for all templates: it takes a third of a second to start."""
+    from wiw.vlm.template_filler import TemplateFiller
+
+    return TemplateFiller()
+
+
+def make_paper(path: Path) -> None:
+    from test_prompt_import import PLANNER, write_paper
+
+    write_paper(path.parent, ("ImageNav Planner Prompt", PLANNER), ("AR Answerer Prompt", "Name \\emph{it}."))
+
+
+def read_paper(path: Path) -> Any:
+    from wiw.policies.vlm.prompt_import.slots import convert_slots
+    from wiw.policies.vlm.prompt_import.sources import read_source
+
+    return {name: convert_slots(name, prompt) for name, prompt in read_source(path)[0].items()}
 
 
 def read_announcement(path: Path) -> Any:
@@ -389,9 +469,12 @@ READERS: dict[str, Reader] = {
     "episodes": Reader(write_and_take("e.json", make_episodes), from_file("e.json", read_episodes), "json"),
     "questions": Reader(write_and_take("q.json", make_questions), from_file("q.json", read_questions), "json"),
     "preset": Reader(take_config("default/imagenav.yaml"), from_file("p.yaml", read_preset), "yaml"),
+    "scene instance": Reader(write_and_take("s.json", make_scene_instance), read_scene_instance, "json"),
     "study": Reader(take_config("studies/vlm.yaml"), from_file("s.yaml", read_study), "yaml"),
     "recipe": Reader(take_config("post-training/pocket.yaml"), from_file("r.yaml", read_recipe), "yaml"),
     "rollout": Reader(write_and_take("r.frames", make_rollout), read_rollout),
+    "prompts": Reader(lambda folder: TEMPLATE, read_prompts),
+    "paper": Reader(write_and_take("main.tex", make_paper), from_file("main.tex", read_paper)),
     "announcement": Reader(
         lambda folder: b'{"address": "ws://a:1", "token": "t"}', from_file("1.json", read_announcement), "json"
     ),
@@ -403,6 +486,8 @@ READERS: dict[str, Reader] = {
     "message": Reader(make_message, read_message, "msgpack"),
     "row": Reader(make_row, read_row, "msgpack"),
     "reply": Reader(make_reply, read_reply, "msgpack", (OSError,)),  # a model's process that broke its protocol
-    "weights": Reader(write_and_take("w.safetensors", make_weights), from_file("w.safetensors", read_weights)),
+    "weights": Reader(
+        write_and_take("w.safetensors", make_weights), from_file("w.safetensors", read_weights), "safetensors"
+    ),
     "frames": Reader(write_and_take("f.parquet", make_frames), from_file("f.parquet", read_frames)),
 }

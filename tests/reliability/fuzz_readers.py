@@ -46,7 +46,7 @@ def fuzz(name: str, folder: Path, options: list[str]) -> None:
     reader = READERS[name]
     sample = reader.make_sample(folder)
     reader.read(sample, folder)  # imports what it needs
-    instrument("wiw", "json", "gzip")
+    instrument("wiw", "json", "gzip", "jinja2")
     corpus = folder / "corpus"
     corpus.mkdir()
     (corpus / "sample").write_bytes(sample)

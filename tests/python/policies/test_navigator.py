@@ -126,6 +126,14 @@ def test_weights_are_saved_with_what_they_are_built_of(tmp_path: Path) -> None:
         Navigator(tmp_path / "none.safetensors")
 
 
+def test_weights_of_an_infinite_width_are_refused(tmp_path: Path) -> None:
+    network = tiny_network()
+    network.width = np.inf
+    save(tmp_path / "weights.safetensors", network, CARD)
+    with pytest.raises(WeightsError, match="expected complete weights of navigator: cannot convert float infinity"):
+        load(tmp_path / "weights.safetensors")
+
+
 # -- ways --------------------------------------------------------------------------------------------------------------
 
 

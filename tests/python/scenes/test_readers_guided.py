@@ -13,8 +13,8 @@ import pytest
 from locations import TESTS
 from readers import READERS
 
-COMPILED = {"glb", "link stl", "navmesh", "scene cache", "weights"}
-"""Readers with nothing for Atheris to see; `scripts/fuzz_compiled` guides them, but for that of safetensors."""
+COMPILED = {"glb", "link stl", "navmesh", "scene cache"}
+"""Readers with nothing for Atheris to see, which `scripts/fuzz_compiled` guides."""
 GUIDED = [name for name in READERS if name not in COMPILED]
 FEW, MANY = 300 // len(GUIDED), int(os.environ.get("WIW_FUZZ_SECONDS", "600"))
 """Seconds of each reader."""

@@ -489,6 +489,7 @@ class TestSceneDataset:
             ({"stage_instance": {}}, "cannot be read as a scene instance .*KeyError: 'template_name'"),
             ({"object_instances": [{"template_name": "chair", "rotation": [0, 0, 0, 0]}]}, "is not a quaternion"),
             ({"object_instances": [{"template_name": "chair", "translation": [1, 2]}]}, "three finite numbers"),
+            ({"object_instances": [{"template_name": "chair", "translation": [0, 0, 10**400]}]}, "OverflowError"),
             ({"object_instances": 3}, "cannot be read as a scene instance"),
         ],
     )

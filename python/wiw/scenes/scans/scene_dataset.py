@@ -37,7 +37,7 @@ from wiw.scenes.scans.urdf import read_visuals
 
 ENDING = ".scene_instance.json"
 CONFIG = ".scene_dataset_config.json"
-_UNREADABLE = (LookupError, TypeError, ValueError, AttributeError)
+_UNREADABLE = (LookupError, TypeError, ValueError, AttributeError, OverflowError)
 _CONFIG_OF = {
     "stages": ".stage_config.json",
     "objects": ".object_config.json",
