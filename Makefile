@@ -5,6 +5,7 @@
 BIN := .venv/bin
 TESTS := build/tests
 JOBS ?= $(shell nproc)
+export CLANG ?= 19
 export CXX  # one name for the package's build and that of the C++ tests: ccache compiles what both need once
 
 help:       ## this list
@@ -28,9 +29,11 @@ bench:      ## every speed claim, side by side with what a user would pick inste
 	@scripts/setup test
 	$(BIN)/python tests/benchmark/run_all.py
 
-nightly:    ## what takes too long for every change: the dearest tests, and the small data-scaling study
+nightly:    ## what takes too long for every change: the dearest tests, fuzzing, and the small data-scaling study
 	@scripts/setup test nightly
 	$(BIN)/python -m pytest -n $(JOBS) --dist loadfile --no-loadscope-reorder -m "nightly or extra"
+	@if command -v clang++-$(CLANG) >/dev/null; then scripts/fuzz_compiled; else \
+	  echo "nightly: the compiled readers are not fuzzed, for there is no clang++-$(CLANG)"; fi
 	rm -rf build/nightly
 	$(BIN)/wiw study data-scaling --small --workers $(JOBS) --out build/nightly/data-scaling
 
