@@ -23,6 +23,7 @@ from wiw.datasets.navigation import NavigationData
 from wiw.errors import ArgumentError, FileError
 from wiw.files import atomic_file
 from wiw.networks import resolve_device
+from wiw.policies.matcher.policy import SOURCE
 from wiw.scenes import resolve
 from wiw.studies.data_scaling_plan import (
     FULL,
@@ -304,9 +305,17 @@ def _run_imagenav(
 
 
 def name_arms(jobs: Sequence[TrainingJob], seed: int) -> dict[str, str]:
-    """Return the world models of a seed as arms of a run, by their trainings' names."""
+    """Return the world models of a seed as arms of a run, by their trainings' names.
+
+    They draw panoramas no larger than the matcher reads, which takes a fraction of the time, or as their networks do
+    where that is larger.
+    """
     return {
-        job.training.setting: f"{job.training.model}?weights={job.weights.absolute()}"
+        job.training.setting: f"{job.training.model}?weights={job.weights.absolute()}&size={_choose_arm_size(job.plan)}"
         for job in jobs
         if job.training.seed == seed
     }
+
+
+def _choose_arm_size(plan: ScalingPlan) -> list[int]:
+    return [max(sides) for sides in zip(SOURCE, plan.settings.size, strict=True)]

@@ -33,6 +33,7 @@ from wiw.analysis.statistics import estimate_mean
 from wiw.cli import main
 from wiw.errors import ArgumentError, FileError
 from wiw.metrics.metric import SUCCESS
+from wiw.policies.matcher.policy import SOURCE
 from wiw.report.data_scaling_tables import explain
 
 pytest.importorskip("pyarrow", reason="needs wiw[export]")
@@ -467,6 +468,9 @@ def test_models_become_arms_of_a_run(study: DataScaling, dataset: Path) -> None:
     arm = arms[jobs[-1].training.setting]
     model = wiw.world_model(arm.model, **arm.model_options)
     assert model.card["training"] == asdict(jobs[-1].training)
+    assert model.accepts.size == SOURCE and not model.accepts.is_scalable, "the loop does not ask it for less itself"
+    finer = replace(jobs[-1], plan=replace(study.plan, settings=replace(SETTINGS, size=(160, 320))))
+    assert name_arms([finer], 1)[finer.training.setting].endswith("&size=[160, 320]"), "no less than the network's"
 
 
 def test_pocket_is_trained_and_measured_by_the_same_job(
