@@ -24,6 +24,7 @@ from wiw.datasets.navigation_files import (
     FORMAT,
     SEGMENTS,
     build_table,
+    describe_file,
     navigation_schema,
     write_frames,
     write_segment_list,
@@ -59,7 +60,8 @@ def save_dataset(
     rows = [_list_segment(each, group) for group, each in enumerate(segments)]
     write_segment_list(folder / SEGMENTS, rows)
     camera = {"projection": projection, "size": [64, 128], "height_m": height}
-    meta = {"format": FORMAT, "split": split, "camera": camera, "files": {"frames.parquet": {"sha256": "0"}}}
+    files = {"frames.parquet": describe_file(folder / "frames.parquet", frames * len(scenes))}
+    meta = {"format": FORMAT, "split": split, "camera": camera, "files": files}
     (folder / META).write_text(json.dumps(meta))
     (folder / MANIFEST).write_text(json.dumps({"what": "navigation"}))
     return folder

@@ -112,6 +112,15 @@ class NavigationData(Sequence[NavigationSegment]):
         """Return the SHA-256 of the files' checksums, which identifies the dataset."""
         return sha256(json.dumps(self.meta["files"], sort_keys=True).encode()).hexdigest()
 
+    def require_files(self) -> None:
+        """Check that all files are there in the size that `meta.json` says; none is read.
+
+        Raises:
+            FileError: one is missing or of another size.
+        """
+        for name, recorded in self.meta["files"].items():
+            _require_size(self.folder / name, recorded.get("bytes"))
+
     def clips(self, length: int, stride: int = 1) -> Clips:
         """Return all windows of `length` frames that begin `stride` frames apart within a segment.
 
@@ -194,6 +203,22 @@ class SelectedClips(Sequence[NavigationSegment]):
         return self._clips.locate(self._rows[index])
 
 
+def _require_size(path: Path, expected: int | None) -> None:
+    """Raise FileError unless a file is there and, where its size is known, has it."""
+    remedy = "copy it again, or repeat `wiw collect navigation` to recreate it"
+    try:
+        size = path.stat().st_size
+    except FileNotFoundError as error:
+        raise FileError(f"{path} is missing; {remedy}") from error
+    except OSError as error:
+        raise FileError(f"{path}: cannot be read ({error.strerror}); {remedy}") from error
+    if expected not in (None, size):
+        raise FileError(
+            f"{path}: expected {expected} bytes, as in {META}, got {size}; {remedy} (`wiw data verify` finds what else "
+            "is damaged)"
+        )
+
+
 def part_of(name: str, held_out: float) -> Literal["train", "held-out"]:
     """Return the part that a scene or demonstration belongs to, by a hash of its name: adding some moves no other.
 
@@ -216,7 +241,8 @@ def read_meta(folder: Path) -> dict[str, Any]:
             f"{path} is missing; `wiw collect navigation` writes it at the end: repeat that command until it finishes"
         )
     found = read_json_object(path, "the description of a navigation dataset, which `wiw collect navigation` writes")
-    if not isinstance(found.get("files"), dict):
+    files = found.get("files")
+    if not isinstance(files, dict) or not all(isinstance(each, dict) for each in files.values()):
         raise FileError(f"{path}: expected the description of a navigation dataset, got no list of files")
     if found.get("format") != FORMAT:
         raise FileError(f"{path}: expected a navigation dataset of format {FORMAT}, got {found.get('format')}")

@@ -6,6 +6,8 @@ from __future__ import annotations
 import io
 import json
 import os
+import re
+import shutil
 import signal
 from dataclasses import replace
 from functools import partial
@@ -44,6 +46,7 @@ import tiny_pipelines
 from wiw.training.post_training.clip_order import ClipOrder
 from wiw.training.post_training.clips import load_clips
 from wiw.training.post_training.conditioned_generator import add_lora
+from wiw.training.post_training.corpora import open_corpus
 from wiw.training.post_training.families import FAMILIES, VideoFamily, find_family
 from wiw.training.post_training.noise import draw_shifted_uniform, weigh_by_bell
 from wiw.training.post_training.nwm import TrainableNWM
@@ -569,6 +572,28 @@ def test_what_cannot_be_trained_is_refused(data: Path, weights: Any, tmp_path: P
     (tmp_path / "full" / "note").touch()
     with pytest.raises(ArgumentError, match="is not empty"):
         post_train("ltx-action", data, tmp_path / "full", recipe=recipe, **options)
+
+
+@pytest.mark.parametrize(
+    ("kept", "said"),
+    [(None, "frames.parquet is missing"), (0.9, r"frames.parquet: expected \d+ bytes, as in meta.json, got \d+")],
+)
+def test_a_file_that_is_not_whole_is_told_before_weights_are_loaded(
+    kept: float | None, said: str, data: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    folder = Path(shutil.copytree(data, tmp_path / "data"))
+    assert open_corpus(folder, "train").units
+    path = folder / "frames.parquet"
+    whole = path.read_bytes()
+    path.unlink()
+    if kept is not None:
+        path.write_bytes(whole[: int(kept * len(whole))])
+    with pytest.raises(FileError, match=said + ".*; copy it again, or repeat `wiw collect navigation`"):
+        open_corpus(folder, "train")
+    command = ["train", "ltx-action", "--data", str(folder), "--out", str(tmp_path / "out")]
+    assert main([*command, "--weights", str(tmp_path / "no-weights")]) == 2
+    assert re.search(said, " ".join(capsys.readouterr().err.split()))
+    assert not list(tmp_path.glob("out*"))
 
 
 def test_a_lora_that_covers_nothing_is_refused() -> None:

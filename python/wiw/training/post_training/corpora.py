@@ -107,7 +107,7 @@ class Corpus(ABC):
 
 
 def open_corpus(folder: str | Path, part: Part, held_out: float = 0.05) -> Corpus:
-    """Open a folder of `wiw collect navigation` or `wiw collect manipulation`.
+    """Open a folder of `wiw collect navigation` or `wiw collect manipulation`, with all of its files in place.
 
     Args:
         folder: as the command left it.
@@ -115,13 +115,15 @@ def open_corpus(folder: str | Path, part: Part, held_out: float = 0.05) -> Corpu
         held_out: share of the scenes, or of the demonstrations, that "train" leaves out.
 
     Raises:
-        FileError: it is neither, not finished, or damaged.
+        FileError: it is neither, not finished, or damaged, or a file of it is missing or cut short.
         DependencyError: pyarrow is not installed.
     """
     folder = Path(folder)
     if is_demonstrations(folder):
         return DemonstrationCorpus(Demonstrations(folder), part, held_out)
-    return NavigationCorpus(NavigationData(folder, part, held_out), part)
+    data = NavigationData(folder, part, held_out)
+    data.require_files()  # before weights are loaded: a clip in a file that is not whole may come up after hours
+    return NavigationCorpus(data, part)
 
 
 def require_training_split(corpus: Corpus) -> None:
