@@ -43,6 +43,7 @@ from post_training_parts import (
 )
 
 import tiny_pipelines
+from wiw.training.post_training import svd
 from wiw.training.post_training.clip_order import ClipOrder
 from wiw.training.post_training.clips import load_clips
 from wiw.training.post_training.conditioned_generator import add_lora
@@ -508,6 +509,31 @@ def test_shipped_recipes_are_those_of_the_world_models() -> None:
         assert recipe.size is None and recipe.epochs == 1 and recipe.clips == 40_000
         if isinstance(family, VideoFamily):
             assert recipe.frames == family.model.accepts.frames and recipe.drop == 0.1
+
+
+NUMBERS = {
+    # frames, rate, schedule, warmup, clip_norm, LoRA, shift
+    "svd-action": (14, 2e-5, "cosine", 0.2, 0.5, 0, 1.0),  # warm-up: 500 of 2,500 steps of 16 clips
+    "ltx-action": (17, 1e-5, "linear", 0.0, 1.0, 0, 1.0),  # its noise is shifted by the number of tokens instead
+    "wan2.1-action": (13, 1e-4, "constant", 0.0, 1.0, 32, 5.0),
+    "wan2.2-5b-action": (13, 1e-5, "constant", 0.0, 1.0, 0, 5.0),
+    "wan2.2-a14b-action": (13, 1e-4, "constant", 0.0, 1.0, 32, 5.0),
+    "cosmos-predict2-action": (13, 4e-5, "constant", 0.0, 1.0, 0, 1.0),
+    "nwm-action": (5, 8e-5, "constant", 0.0, 10.0, 0, 1.0),
+}
+"""Frames, and which models are trained by LoRA, are the paper's, which leaves NWM as it is; the rest are the numbers of
+each model's own training code."""
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_shipped_recipes_have_the_numbers_of_the_models_own_trainings(name: str) -> None:
+    recipe = load_recipe(name)
+    chosen = recipe.frames, recipe.rate, recipe.schedule, recipe.warmup, recipe.clip_norm, recipe.lora, recipe.shift
+    assert chosen == NUMBERS[name] and recipe.batch == 16
+
+
+def test_the_noise_of_svd_is_log_normal_with_its_published_moments() -> None:
+    assert svd.LOG_SIGMA == (0.7, 1.6) and svd.LOG_GIVEN == (-3.0, 0.5)
 
 
 def test_rates_are_those_of_the_middle_of_a_step() -> None:
