@@ -16,6 +16,7 @@ import pytest
 from wiw.cli import main
 from wiw.datasets.navigation import NavigationData
 from wiw.errors import ArgumentError, FileError, TrainingError
+from wiw.studies.run_log import load_run
 from wiw.training.collect_navigation import collect_navigation
 
 pytest.importorskip("pyarrow", reason="needs wiw[export]")
@@ -299,6 +300,15 @@ def test_the_command_trains_measures_and_is_run(
     assert card["steps"] == 2 and set(card["held_out"]) == {"mixed", "straight"}
     assert set(card["held_out"]["mixed"]["psnr"]) == {"copy", "rolled", "one room", "pocket"}
     assert not list(tmp_path.glob("*.checkpoint"))
+    preset = tmp_path / "short.yaml"
+    preset.write_text("base: paper\ndecisions: 2\n")
+    command = ["run", "imagenav", "--scenes", two_rooms, "--preset", str(preset), "--episodes", "1", "--no-report"]
+    command += ["--arms", f"pocket=pocket?weights={out}&size=[144, 256]", "--out", str(tmp_path / "run")]
+    assert main([*command, "--cache", "off"]) == 0
+    log = load_run(tmp_path / "run")
+    assert [episode["status"] for episode in log.episodes] == ["done"] and len(log.decisions) == 2
+    assert all(decision["calls"]["rows"] > 0 for decision in log.decisions)
+    assert log.store.info["built"]["pocket"]["model"]["digest"] == Pocket(out).describe()["digest"]
 
 
 @pytest.mark.parametrize(("given", "seed"), [([], 5), (["--seed", "0"], 0), (["--seed", "3"], 3)])
