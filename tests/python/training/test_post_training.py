@@ -7,6 +7,7 @@ import io
 import json
 import os
 import re
+import shlex
 import shutil
 import signal
 from dataclasses import replace
@@ -24,6 +25,7 @@ from wiw.cli.stop import EXIT_RESUME
 from wiw.cli.train.progress import TrainingProgress
 from wiw.cli.train.video import RUN_AS, VIDEO
 from wiw.errors import ArgumentError, FileError, TrainingError
+from wiw.studies.run_log import load_run
 from wiw.types import Conditioning, Control
 
 pytest.importorskip("diffusers", reason="no diffusers: pip install 'wiw[diffusers]'")
@@ -631,7 +633,9 @@ def test_a_lora_that_covers_nothing_is_refused() -> None:
 # -- the command -------------------------------------------------------------------------------------------------------
 
 
-def test_the_command_trains(data: Path, weights: Any, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_the_command_trains_and_names_one_that_runs_the_checkpoint(
+    data: Path, weights: Any, two_rooms: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
     recipe = tmp_path / "mine.yaml"
     recipe.write_text("{frames: 9, size: [64, 128], batch: 2, clips: 4}")
     command = ["train", "ltx-action", "--data", str(data), "--weights", str(weights("ltx-action")), "--part", "all"]
@@ -644,6 +648,16 @@ def test_the_command_trains(data: Path, weights: Any, tmp_path: Path, capsys: py
     assert "training: step 4/4" in said.err and "clips/s" in said.err and "GB" in said.err
     card = json.loads((out / "training.json").read_text())
     assert card["recipe"]["rate"] == 1e-3 and card["recipe"]["batch"] == 2 and card["steps"] == 4
+    named = re.search(r"wiw (run imagenav --world-model ltx-action .*)", said.out)
+    assert named is not None
+    preset = tmp_path / "short.yaml"
+    preset.write_text("base: paper\ndecisions: 2\n")
+    short = ["--scenes", two_rooms, "--preset", str(preset), "--episodes", "1", "--no-report", "--cache", "off"]
+    command = [*shlex.split(named[1]), "--world-model-option", "steps=2", *short, "--out", str(tmp_path / "run")]
+    assert main(command) == 0
+    log = load_run(tmp_path / "run")
+    assert [episode["status"] for episode in log.episodes] == ["done"] and len(log.decisions) == 2
+    assert all(decision["calls"]["rows"] > 0 for decision in log.decisions)
 
 
 @pytest.mark.parametrize(
