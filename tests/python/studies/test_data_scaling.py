@@ -52,6 +52,7 @@ from wiw.studies.data_scaling_plan import (  # noqa: E402
     choose_sizes,
 )
 from wiw.studies.data_scaling_training import Material, TrainingJob, list_scenes  # noqa: E402
+from wiw.studies.run_log import load_run  # noqa: E402
 from wiw.training.collect_navigation import collect_navigation  # noqa: E402
 from wiw.training.place_trainer import PlaceTrainer  # noqa: E402
 from wiw.training.reduced_frames import reduce_frames  # noqa: E402
@@ -471,6 +472,21 @@ def test_models_become_arms_of_a_run(study: DataScaling, dataset: Path) -> None:
     assert model.accepts.size == SOURCE and not model.accepts.is_scalable, "the loop does not ask it for less itself"
     finer = replace(jobs[-1], plan=replace(study.plan, settings=replace(SETTINGS, size=(160, 320))))
     assert name_arms([finer], 1)[finer.training.setting].endswith("&size=[160, 320]"), "no less than the network's"
+
+
+@pytest.mark.nightly
+def test_trained_models_run_an_episode_in_closed_loop(study: DataScaling, dataset: Path, tmp_path: Path) -> None:
+    jobs = [TrainingJob(training, study.plan, dataset, study.out) for training in study.plan.list_trainings()]
+    arms = name_arms(jobs, study.plan.settings.seeds[0])
+    found = _run_imagenav(jobs, study.plan, tmp_path, 1, 1)
+    assert [each.name for each in found] == ["none", *arms]
+    assert all(each.success.value in (0, 100) for each in found)
+    log = load_run(tmp_path / "imagenav-1")
+    assert [episode["status"] for episode in log.episodes] == ["done"] * len(found)
+    assert all(log.store.info["built"][name]["model"]["size"] == list(SOURCE) for name in arms)
+    again = _run_imagenav(jobs, study.plan, tmp_path, 1, 1)
+    assert [each.success.value for each in again] == [each.success.value for each in found]
+    assert load_run(tmp_path / "imagenav-1").decisions == log.decisions, "what is finished is not run again"
 
 
 def test_pocket_is_trained_and_measured_by_the_same_job(
