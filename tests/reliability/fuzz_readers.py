@@ -3,13 +3,18 @@
 -runs=1000000 or -max_total_time=300]. Needs `pip install atheris`; without arguments it lists the readers.
 
 libFuzzer prints coverage (`cov`), and writes what fails to crash-*; a failure belongs into a test. Damage within the
-structure of msgpack, JSON, YAML, GLB and SQLite takes turns with libFuzzer's own.
+structure of msgpack, JSON, YAML, GLB, safetensors and SQLite takes turns with libFuzzer's own. Besides a sample it
+begins with the files of `tests/data/fuzz/READER`, each of which reaches other code. To keep what a run has found:
+
+    fuzz_readers.py READER -max_total_time=300 FOUND
+    fuzz_readers.py READER -merge=1 tests/data/fuzz/READER FOUND
 """
 
 from __future__ import annotations
 
 import random
 import resource
+import shlex
 import signal
 import sys
 from pathlib import Path
@@ -21,7 +26,7 @@ import atheris
 HERE = Path(__file__).parent
 sys.path[:0] = [str(HERE.parent), str(HERE.parent / "python")]
 
-from locations import ROOM_FOLDERS  # noqa: E402
+from locations import ROOM_FOLDERS, TESTS  # noqa: E402
 
 sys.path.extend(ROOM_FOLDERS)
 
@@ -72,7 +77,10 @@ def fuzz(name: str, folder: Path, options: list[str]) -> None:
     signal.signal(signal.SIGINT, signal.default_int_handler)
     # A limit of the process's own: libFuzzer's counts what the parent had in memory when it started this process.
     resource.setrlimit(resource.RLIMIT_DATA, (MOST_BYTES, MOST_BYTES))
-    atheris.Setup([sys.argv[0], "-timeout=60", "-rss_limit_mb=0", *options, str(corpus)], read, **mutator)
+    kept = TESTS / "data" / "fuzz" / name
+    places = [str(place) for place in (corpus, kept) if place.is_dir()]  # what is found goes into the first of all
+    again = shlex.join([sys.executable, __file__, name])  # a shell runs it for -merge and -jobs
+    atheris.Setup([again, "-timeout=60", "-rss_limit_mb=0", *options, *places], read, **mutator)
     atheris.Fuzz()
 
 

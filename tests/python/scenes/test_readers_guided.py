@@ -16,8 +16,8 @@ from readers import READERS
 COMPILED = {"glb", "link stl", "navmesh", "scene cache"}
 """Readers with nothing for Atheris to see, which `scripts/fuzz_compiled` guides."""
 GUIDED = [name for name in READERS if name not in COMPILED]
-FEW, MANY = 300 // len(GUIDED), int(os.environ.get("WIW_FUZZ_SECONDS", "600"))
-"""Seconds of each reader."""
+FEW, MANY = 255 // len(GUIDED), int(os.environ.get("WIW_FUZZ_SECONDS", "600"))
+"""Seconds of each reader, which takes some more to start."""
 
 
 def fuzz(name: str, folder: Path, *options: str) -> None:
