@@ -523,12 +523,12 @@ NUMBERS = {
     "cosmos-predict2-action": (13, 4e-5, "constant", 0.0, 1.0, 0, 1.0),
     "nwm-action": (5, 8e-5, "constant", 0.0, 10.0, 0, 1.0),
 }
-"""Frames, and which models are trained by LoRA, are the paper's, which leaves NWM as it is; the rest are the numbers of
-each model's own training code."""
+"""Frames, and which models are trained by LoRA, are the paper's, which leaves NWM as it is; the rest follow each
+model's own training where that is published."""
 
 
 @pytest.mark.parametrize("name", NAMES)
-def test_shipped_recipes_have_the_numbers_of_the_models_own_trainings(name: str) -> None:
+def test_shipped_recipes_have_these_numbers(name: str) -> None:
     recipe = load_recipe(name)
     chosen = recipe.frames, recipe.rate, recipe.schedule, recipe.warmup, recipe.clip_norm, recipe.lora, recipe.shift
     assert chosen == NUMBERS[name] and recipe.batch == 16
