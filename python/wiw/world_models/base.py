@@ -290,20 +290,31 @@ class WorldModel(ABC):
     credits: float | None = None
     """Credits that a paid service has charged so far; None if imagining is free."""
 
+    def __init_subclass__(cls, **kwargs: Any) -> None:
+        super().__init_subclass__(**kwargs)
+        is_base = "accepts" in inspect.get_annotations(cls)
+        if "rollout" in cls.__dict__ and not is_base:
+            cls._require_declaration()
+
     def __new__(cls, *args: Any, **kwargs: Any) -> Self:
         """Make an instance that knows what a user's class was constructed with.
 
         Raises:
-            ContractError: the class declares nothing; a class that others derive from need not.
+            ContractError: the class leaves its declaration to classes derived from it.
         """
-        if not isinstance(declared := getattr(cls, "accepts", None), Accepts | property):
-            raise ContractError(
-                f"{cls.__name__}: expected the class attribute `accepts = wiw.accepts(...)`, got {declared!r}"
-            )
+        cls._require_declaration()
         made = super().__new__(cls)
         if not cls.__module__.startswith("wiw."):
             made._constructed_with = _list_arguments(cls, args, kwargs)
         return made
+
+    @classmethod
+    def _require_declaration(cls) -> None:
+        if not isinstance(declared := getattr(cls, "accepts", None), Accepts | property):
+            raise ContractError(
+                f"{cls.__name__}: expected the class attribute `accepts = wiw.accepts(...)`, got {declared!r}; a class "
+                "that is only a base of others says `accepts: wiw.Accepts`"
+            )
 
     _constructed_with: tuple[dict[str, Any], tuple[str, ...]] = ({}, ())
     """The constructor's arguments that are plain values, by name, and the names of others."""

@@ -180,6 +180,8 @@ import wiw
 
 
 class Base(wiw.WorldModel):
+    accepts: wiw.Accepts
+
     def rollout(self, observations, controls, seeds):
         return np.repeat(observations.image[:, None], len(controls[0].actions) + 1, 1)
 
@@ -190,7 +192,7 @@ class Mine(Base):
 
 
 @pytest.mark.parametrize("make", [wiw.world_model, WORLD_MODELS.make_here])
-def test_a_base_of_world_models_needs_no_declaration(tmp_path: Path, make: Any) -> None:
+def test_a_base_of_world_models_leaves_the_declaration_to_others(tmp_path: Path, make: Any) -> None:
     file = tmp_path / "mine.py"
     file.write_text(BASE)
     assert make(f"{file}:Mine").accepts.control == "image"
