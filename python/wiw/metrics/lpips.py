@@ -2,7 +2,8 @@
 """LPIPS, the perceptual distance of Zhang et al. 2018, version 0.1 on AlexNet's features.
 
 Two published files make it what papers call LPIPS; they are identified by their SHA-256. Without them there is no
-value: there is no substitute.
+value: there is no substitute. Of the larger one, AlexNet, only the convolutions are used; a file of these alone, with
+the same values, serves as well.
 """
 
 from __future__ import annotations
@@ -52,6 +53,10 @@ HEADS = Weights(
     "6 kB",
 )
 """Also in the `lpips` package, as `lpips/weights/v0.1/alex.pth`."""
+CONVOLUTIONS = "alexnet-owt-7be5be79-convolutions.safetensors"
+"""Name of a file that may take the backbone's place: its tensors `features.*` alone (10 MB; docs/quality.md)."""
+CONVOLUTIONS_SHA256 = "276812cc7430109e87ad2847e4409809bf867956c8a5e9621ae88a1bfcb08e76"
+"""SHA-256 of their values: float32, little-endian, one tensor after the other in the order of their names."""
 
 
 def default_folder() -> Path:
@@ -132,7 +137,9 @@ def _features(x: Any, weights: Mapping[str, Any]) -> Iterator[Any]:
 @cache
 def _read(folder: Path, device: str) -> tuple[str, dict[str, Any]]:
     """Return the device and both files' tensors on it, without AlexNet's classifier."""
-    absent = [file.name for file in (BACKBONE, HEADS) if not (folder / file.name).is_file()]
+    alone = folder / CONVOLUTIONS
+    files = [HEADS] if alone.is_file() else [BACKBONE, HEADS]
+    absent = [file.name for file in files if not (folder / file.name).is_file()]
     if absent:
         raise WeightsError(
             f"LPIPS: {' and '.join(absent)} not found in {folder}. It needs two published files there, {BACKBONE.name} "
@@ -140,7 +147,7 @@ def _read(folder: Path, device: str) -> tuple[str, dict[str, Any]]:
             f"lpips/weights/v0.1/{HEADS.name}):\n  curl -L --create-dirs --output-dir {folder} -O {BACKBONE.url} -O "
             f"{HEADS.url}"
         )
-    for file in (BACKBONE, HEADS):
+    for file in files:
         _require_published(folder / file.name, file)
     try:
         import torch
@@ -148,10 +155,35 @@ def _read(folder: Path, device: str) -> tuple[str, dict[str, Any]]:
         raise DependencyError("LPIPS needs torch, which is not installed: pip install 'wiw[torch]'") from None
 
     where = ("cuda" if torch.cuda.is_available() else "cpu") if device == "auto" else device
-    weights: dict[str, Any] = {}
-    for file in (BACKBONE, HEADS):
+    weights = _read_convolutions(alone) if BACKBONE not in files else {}
+    for file in files:
         weights |= torch.load(folder / file.name, map_location="cpu", weights_only=True)
     return where, {name: value.to(where) for name, value in weights.items() if not name.startswith("classifier")}
+
+
+def _read_convolutions(path: Path) -> dict[str, Any]:
+    """Return the tensors of a file of AlexNet's convolutions alone, whose values must be the published ones."""
+    import torch
+    from safetensors import SafetensorError
+    from safetensors.torch import load_file
+
+    names = sorted(f"features.{number}.{part}" for number, *_ in STAGES for part in ("weight", "bias"))
+    try:
+        weights = load_file(path)
+    except (SafetensorError, OSError) as error:
+        raise WeightsError(f"{path}: not a safetensors file: {error}", "unfit") from None
+    state = hashlib.sha256()
+    if sorted(weights) == names and all(weights[name].dtype == torch.float32 for name in names):
+        for name in names:
+            state.update(weights[name].contiguous().numpy().astype("<f4").tobytes())
+    if state.hexdigest() != CONVOLUTIONS_SHA256:
+        raise WeightsError(
+            f"{path}: expected the convolutions of the published {BACKBONE.name} as float32 ({', '.join(names)}), got "
+            f"other tensors or values; with other weights the distance would not be LPIPS. Delete it, and fetch "
+            f"{BACKBONE.url} in its place",
+            "unfit",
+        )
+    return dict(weights)
 
 
 def _require_published(path: Path, file: Weights) -> None:

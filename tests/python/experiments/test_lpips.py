@@ -110,6 +110,45 @@ def test_images_that_it_cannot_measure(published) -> None:
     assert measure(a[:, :32, :32], 255 - a[:, :32, :32]) > 0
 
 
+@pytest.fixture
+def convolutions(published, tmp_path, monkeypatch):
+    """The backbone's convolutions, taken for the published ones, and a folder that has the other file alone."""
+    backbone = pytest.importorskip("torch").load(published / lpips.BACKBONE.name)
+    tensors = {name: backbone[name] for name in sorted(backbone) if name.startswith("features.")}
+    digest = hashlib.sha256(b"".join(tensor.numpy().tobytes() for tensor in tensors.values())).hexdigest()
+    monkeypatch.setattr(lpips, "CONVOLUTIONS_SHA256", digest)
+    (tmp_path / lpips.HEADS.name).write_bytes((published / lpips.HEADS.name).read_bytes())
+    return tensors, tmp_path
+
+
+def test_the_convolutions_alone_serve_as_well(published, convolutions) -> None:
+    tensors, folder = convolutions
+    pytest.importorskip("safetensors.torch").save_file(tensors, folder / lpips.CONVOLUTIONS)
+    a, b = images(2)
+    assert Lpips(folder)(a, b) == Lpips(published)(a, b)
+
+
+@pytest.mark.parametrize("change", ["value", "type", "less", "more", "cut"])
+def test_other_convolutions_are_refused(convolutions, change) -> None:
+    torch, safetensors = pytest.importorskip("torch"), pytest.importorskip("safetensors.torch")
+    tensors, folder = convolutions
+    if change == "value":
+        tensors["features.0.bias"][0] += 1e-3
+    elif change == "type":
+        tensors = {name: tensor.half() for name, tensor in tensors.items()}
+    elif change == "less":
+        del tensors["features.10.bias"]
+    elif change == "more":
+        tensors["classifier.1.bias"] = torch.zeros(2)
+    path = folder / lpips.CONVOLUTIONS
+    safetensors.save_file(tensors, path)
+    if change == "cut":
+        path.write_bytes(path.read_bytes()[:1000])
+    with pytest.raises(WeightsError, match=r"convolutions\.safetensors: (expected the conv|not a safe)") as told:
+        Lpips(folder)
+    assert told.value.kind == "unfit"
+
+
 def test_without_the_published_files_there_is_no_lpips(folder, tmp_path, monkeypatch) -> None:
     with pytest.raises(WeightsError, match=r"7be5be79\.pth: expected the published file, of SHA-256 7be5be79") as told:
         Lpips(folder)
