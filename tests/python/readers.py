@@ -34,6 +34,8 @@ Read = Callable[[bytes, Path], Any]
 """Reads bytes, for which it may use a folder."""
 Mutate = Callable[[bytes, random.Random], bytes]
 CONFIGS = Path(wiw.__file__).parent / "configs"
+DATASET_CONFIG = "tiny.scene_dataset_config.json"
+"""Name of the configuration that `scan_files.write_scene_dataset` writes."""
 MOST_BYTES = 3 << 30
 """Memory that a process which reads damaged bytes may take."""
 
@@ -311,6 +313,93 @@ def read_scene_instance(data: bytes, folder: Path) -> Any:
     return scene_dataset.read(path, {}).scene.describe()
 
 
+def make_dataset_config(path: Path) -> None:
+    """Write the configuration of a dataset with one scene, and leave the scene beside it."""
+    from scan_files import write_scene_dataset
+
+    write_scene_dataset(path.parent)
+    shutil.copy(path.parent / DATASET_CONFIG, path)
+
+
+def read_dataset_config(data: bytes, folder: Path) -> Any:
+    """Read the scene that a configuration leads to, and list all that it has."""
+    from wiw.scenes.scans import scene_dataset
+
+    (folder / DATASET_CONFIG).write_bytes(data)
+    scene = scene_dataset.read(folder / "scenes/home.scene_instance.json", {}).scene
+    return scene.describe(), scene_dataset.find(folder, "")
+
+
+def read_lexicon(data: bytes, folder: Path) -> Any:
+    from wiw.scenes.scans.scene_dataset import Dataset
+
+    (folder / "lexicon.json").write_bytes(data)
+    body = {"semantic_scene_descriptor_instances": {"paths": {".json": ["lexicon.json"]}}}
+    return Dataset(folder / DATASET_CONFIG, body).class_names
+
+
+def read_names(data: bytes, folder: Path) -> Any:
+    from wiw.scenes.scans.scene_dataset import Dataset
+
+    (folder / "semantics").mkdir(exist_ok=True)
+    (folder / "semantics/objects.csv").write_bytes(data)
+    return Dataset(folder / DATASET_CONFIG, {}).listed_names
+
+
+def make_annotations(folder: Path) -> bytes:
+    from scan_files import annotation_text
+
+    return annotation_text().encode()
+
+
+def read_annotations(path: Path) -> Any:
+    from wiw.scenes.scans import hm3d
+
+    return hm3d.read_annotations(path)
+
+
+def make_house(folder: Path) -> bytes:
+    from scan_files import house_text
+
+    return house_text().encode()
+
+
+def read_house(path: Path) -> Any:
+    from wiw.scenes.scans import matterport
+
+    return matterport.read_house(path)
+
+
+def make_replica_table(folder: Path) -> bytes:
+    from scan_files import write_replica
+
+    return (write_replica(folder).parent / "info_semantic.json").read_bytes()
+
+
+def read_replica_table(path: Path) -> Any:
+    from wiw.scenes.scans import replica
+
+    return replica.read_objects(path)
+
+
+def read_model_index(path: Path) -> Any:
+    from wiw.world_models.video.weights import require_kind
+
+    return require_kind(path.parent, ["WanPipeline"], {"boundary_ratio": True, "expand_timesteps": False})
+
+
+def make_action_config(path: Path) -> None:
+    from wiw.world_models.video.actions.config import ActionConfig
+
+    ActionConfig(base="wan2.1", weights="w", width=8, stride=4).save(path.parent)
+
+
+def read_action_config(path: Path) -> Any:
+    from wiw.world_models.video.actions.config import ActionConfig
+
+    return ActionConfig.load(path.parent).ids
+
+
 def make_rollout(path: Path) -> None:
     from wiw.loop.rollout_cache import RolloutCache
 
@@ -470,6 +559,20 @@ READERS: dict[str, Reader] = {
     "questions": Reader(write_and_take("q.json", make_questions), from_file("q.json", read_questions), "json"),
     "preset": Reader(take_config("default/imagenav.yaml"), from_file("p.yaml", read_preset), "yaml"),
     "scene instance": Reader(write_and_take("s.json", make_scene_instance), read_scene_instance, "json"),
+    "scene dataset": Reader(write_and_take("d.json", make_dataset_config), read_dataset_config, "json"),
+    "lexicon": Reader(lambda folder: b'{"classes": [{"id": 3, "name": "Couch"}]}', read_lexicon, "json"),
+    "names of objects": Reader(lambda folder: b'id,name,main_category\n7af3,"sofa, grey",sofa\n8b,lamp,\n', read_names),
+    "labels of HM3D": Reader(make_annotations, from_file("s.semantic.txt", read_annotations)),
+    "house of Matterport3D": Reader(make_house, from_file("s.house", read_house)),
+    "table of Replica": Reader(make_replica_table, from_file("info_semantic.json", read_replica_table), "json"),
+    "model index": Reader(
+        lambda folder: b'{"_class_name": "WanPipeline", "boundary_ratio": 0.9, "vae": ["diffusers", "Autoencoder"]}',
+        from_file("model_index.json", read_model_index),
+        "json",
+    ),
+    "action config": Reader(
+        write_and_take("config.json", make_action_config), from_file("config.json", read_action_config), "json"
+    ),
     "study": Reader(take_config("studies/vlm.yaml"), from_file("s.yaml", read_study), "yaml"),
     "recipe": Reader(take_config("post-training/pocket.yaml"), from_file("r.yaml", read_recipe), "yaml"),
     "rollout": Reader(write_and_take("r.frames", make_rollout), read_rollout),

@@ -284,6 +284,7 @@ class TestHm3d:
             ('1,GG0000,"bed",0', "line 2: expected id,RRGGBB"),
             ('1,00FF00,"bed"', "line 2: expected id,RRGGBB"),
             ('1,00FF00,"bed",0\n1,00FF01,"sofa",0', "line 3: .*already used"),
+            ("1,00FF00," + "a" * 200_000 + ",0", "not a table of comma-separated values: field larger"),
         ],
     )
     def test_a_damaged_table_is_named(self, tmp_path: Path, row: str, message: str) -> None:
@@ -368,6 +369,7 @@ class TestReplica:
                 "not a Replica table .*KeyError: 7",
             ),
             ('{"objects": []}', "not a Replica table .*KeyError: 'classes'"),
+            ('{"classes": [{"id": 1e999, "name": "a"}]}', "not a Replica table .*OverflowError"),
         ],
     )
     def test_a_damaged_table_is_named(self, tmp_path: Path, text: str, message: str) -> None:
@@ -497,6 +499,21 @@ class TestSceneDataset:
         path = files.write_scene_dataset(tmp_path)
         files.write_json(path, json.loads(path.read_text()) | change)
         with pytest.raises(FileError, match=rf"home\.scene_instance\.json: .*{message}"):
+            load(path)
+
+    @pytest.mark.parametrize("patterns", [3, ["stages"], {".json": "stages"}, {".json": [3]}, {".json": ["a\0"]}])
+    def test_a_damaged_configuration_is_named(self, tmp_path: Path, patterns: Any) -> None:
+        path = files.write_scene_dataset(tmp_path)
+        config = tmp_path / "tiny.scene_dataset_config.json"
+        body = json.loads(config.read_text())
+        files.write_json(config, body | {"scene_instances": {"paths": patterns}})
+        with pytest.raises(FileError, match=r"config\.json: scene_instances: paths: expected lists of patterns"):
+            load(path)
+
+    def test_a_table_of_names_with_an_endless_cell_is_refused(self, tmp_path: Path) -> None:
+        path = files.write_scene_dataset(tmp_path)
+        (tmp_path / "semantics/objects.csv").write_text("id,name\nchair," + "a" * 200_000)
+        with pytest.raises(FileError, match=r"objects\.csv: not a table of comma-separated values: field larger"):
             load(path)
 
     def test_a_scene_needs_its_dataset(self, tmp_path: Path) -> None:

@@ -285,6 +285,8 @@ def test_checkpoints_that_do_not_fit_are_named(made, world_model_options, tmp_pa
     refused("does not fit its config.json: unet.mlp")
     folder = copied("format", colour="red")
     refused("cannot be used .*colour.*it has base")
+    (folder / "config.json").write_text("[" * 5000)
+    refused("cannot be used .*levels of nested lists")
     folder = copied("encoder")
     (folder / "action_encoder.safetensors").write_bytes(b"nothing")
     refused("action_encoder.safetensors is damaged")

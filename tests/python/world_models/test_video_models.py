@@ -360,8 +360,9 @@ def test_weights_that_are_not_there_or_of_another_model(made, world_model_option
     text.write_bytes(kept)
     file.unlink()
     refused("ltx", copy, "unfit", "missing")
-    (copy / "model_index.json").write_text("{")
-    refused("ltx", copy, "unfit", "is damaged")
+    for text in ("{", "[" * 5000, '["LTXPipeline"]'):
+        (copy / "model_index.json").write_text(text)
+        refused("ltx", copy, "unfit", "is damaged")
 
 
 REFUSALS = {"gated": (403, "GatedRepo"), "absent": (404, "RepoNotFound"), "old": (404, "RevisionNotFound")}

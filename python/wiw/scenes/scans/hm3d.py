@@ -77,7 +77,11 @@ def read_annotations(path: Path) -> Annotations:
     if not lines or HEADER not in lines[0]:
         raise FileError(f"{path}: expected '{HEADER}' in the first line, got {lines[0] if lines else ''!r:.60}")
     table = Annotations({}, {})
-    for number, row in enumerate(csv.reader(lines[1:]), 2):
+    try:
+        rows = list(csv.reader(lines[1:]))
+    except csv.Error as error:
+        raise FileError(f"{path}: not a table of comma-separated values: {error}") from error
+    for number, row in enumerate(rows, 2):
         if not row:
             continue
         try:

@@ -60,7 +60,7 @@ def read_objects(path: Path) -> dict[int, ScanObject]:
         if not body.get("objects"):
             return {i: ScanObject(name, _plain(name)) for i, name in classes.items() if i >= 0}
         return dict(_object(item, classes) for item in body["objects"])
-    except (LookupError, TypeError, ValueError, AttributeError, RecursionError) as error:
+    except (LookupError, TypeError, ValueError, AttributeError, OverflowError) as error:
         raise FileError(f"{path}: not a Replica table ({type(error).__name__}: {error})") from error
 
 

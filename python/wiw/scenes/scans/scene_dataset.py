@@ -87,12 +87,23 @@ class Dataset:
         found = self.body.get(name, {})
         return found if isinstance(found, Mapping) else {}
 
+    def list_patterns(self, section: str) -> Mapping[str, list[str]]:
+        """Return where a section's files are, by kind (".json", ".glb").
+
+        Raises:
+            FileError: what stands there is something else.
+        """
+        paths = self.section(section).get("paths", {})
+        lists = paths.values() if isinstance(paths, Mapping) else [None]
+        if not all(isinstance(patterns, list) and all(map(_is_pattern, patterns)) for patterns in lists):
+            raise FileError(f"{self.path}: {section}: paths: expected lists of patterns by suffix, got {paths!r:.80}")
+        return paths
+
     def find_files(self, section: str, kind: str, ending: str) -> list[Path]:
         """Return the files that a section's patterns of one kind (".json", ".glb") name, in order."""
-        paths = self.section(section).get("paths", {})
         found: dict[Path, None] = {}
-        for pattern in paths.get(kind, []) if isinstance(paths, Mapping) else []:
-            for match in sorted(glob.glob(str(self.path.parent / str(pattern)))):  # noqa: PTH207 - may lead up, by ".."
+        for pattern in self.list_patterns(section).get(kind, []):
+            for match in sorted(glob.glob(str(self.path.parent / pattern))):  # noqa: PTH207 - may lead up, by ".."
                 place = Path(match)
                 files = sorted(place.glob(f"*{ending}")) if place.is_dir() else [place]
                 found |= {file: None for file in files if file.name.endswith(ending)}
@@ -104,10 +115,9 @@ class Dataset:
         table: dict[str, dict[str, list[Path]]] = {}
         for section, ending in _CONFIG_OF.items():
             names: dict[str, list[Path]] = {}
-            kinds = self.section(section).get("paths", {})
-            others = [kind for kind in kinds if kind != ".json"] if isinstance(kinds, Mapping) else []
-            for kind, last in [(".json", ending), *((kind, str(kind)) for kind in others)]:
-                for file in self.find_files(section, str(kind), last):
+            others = [kind for kind in self.list_patterns(section) if kind != ".json"]
+            for kind, last in [(".json", ending), *((kind, kind) for kind in others)]:
+                for file in self.find_files(section, kind, last):
                     names.setdefault(file.name.removesuffix(last), []).append(file)
             table[section] = names
         return table
@@ -148,9 +158,16 @@ class Dataset:
         if not file.is_file():
             return {}
         self.read.append(file)
-        rows = csv.DictReader(read_text(file).splitlines())
+        try:
+            rows = list(csv.DictReader(read_text(file).splitlines()))
+        except csv.Error as error:
+            raise FileError(f"{file}: not a table of comma-separated values: {error}") from error
         words = [(row.get("id", ""), row.get("main_category") or row.get("name") or "") for row in rows]
         return {name: category for name, category in words if name}
+
+
+def _is_pattern(value: Any) -> bool:
+    return isinstance(value, str) and "\0" not in value
 
 
 def read_object(path: Path) -> Mapping[str, Any]:

@@ -3,7 +3,6 @@
 
 from __future__ import annotations
 
-import json
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from hashlib import blake2b
@@ -11,6 +10,7 @@ from pathlib import Path
 from typing import Any
 
 from wiw.errors import ArgumentError, WeightsError
+from wiw.json_text import parse_json
 from wiw.networks import explain_hub_error as explained
 from wiw.networks import is_path
 
@@ -80,7 +80,9 @@ def require_kind(folder: Path, pipelines: Sequence[str], flags: Mapping[str, boo
             "save_pretrained"
         )
     try:
-        content = json.loads(index.read_text(encoding="utf-8"))
+        content = parse_json(index.read_bytes())
+        if not isinstance(content, dict):
+            raise ValueError(f"expected a JSON object, got {type(content).__name__}")
     except ValueError as error:
         raise WeightsError(f"{index} is damaged ({error}); fetch the weights again", "unfit") from error
     found = {name: content.get(name) for name in ("_class_name", *flags)}

@@ -10,6 +10,7 @@ from typing import Any, Literal
 
 from wiw.action import Action
 from wiw.errors import ArgumentError, WeightsError
+from wiw.json_text import parse_json
 from wiw.typed_values import require_positive
 
 FILE = "config.json"
@@ -83,7 +84,7 @@ class ActionConfig:
                 "no weights except those that you train"
             )
         try:
-            content = json.loads(file.read_text(encoding="utf-8"))
+            content = parse_json(file.read_bytes())
             return cls(**content)
         except (ValueError, TypeError, AttributeError, ArgumentError) as error:
             known = ", ".join(field.name for field in fields(cls))
