@@ -3,9 +3,11 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
+from typing import Any
 
 from wiw.errors import FileError
 from wiw.mapping_files import parse_yaml
@@ -33,8 +35,14 @@ class Prices:
 
         try:
             content = parse_yaml(Path(path).expanduser().read_text(encoding="utf-8"))
-            return cls({str(model): (float(read), float(written)) for model, (read, written) in content.items()})
-        except (OSError, UnicodeDecodeError, yaml.YAMLError, AttributeError, TypeError, ValueError) as error:
+            return cls({str(model): (_price(read), _price(written)) for model, (read, written) in content.items()})
+        except (OSError, yaml.YAMLError, AttributeError, TypeError, ValueError, OverflowError) as error:
             raise FileError(
                 f"{path}: expected prices as `model: [read, written]`, dollars per million tokens: {error}"
             ) from error
+
+
+def _price(value: Any) -> float:
+    if not 0 <= float(value) < math.inf:
+        raise ValueError(f"a price of {value}")
+    return float(value)

@@ -17,7 +17,7 @@ from collections.abc import Mapping
 from functools import cache
 from typing import Any
 
-from jinja2 import StrictUndefined, TemplateSyntaxError, meta
+from jinja2 import StrictUndefined, TemplateSyntaxError, meta, nodes
 from jinja2.sandbox import SandboxedEnvironment
 
 SECONDS = 2.0
@@ -39,7 +39,9 @@ def unknown_slot(source: str, slots: Mapping[str, Any]) -> str | None:
     for name in ("raw", "comment"):  # Jinja takes one that is open at the end for an empty one
         if kinds.count(f"{name}_begin") != kinds.count(f"{name}_end"):
             raise TemplateSyntaxError(f"a {name} block does not end", source.count("\n") + 1)
-    unknown = sorted(meta.find_undeclared_variables(ENVIRONMENT.parse(source)) - set(slots))
+    tree = ENVIRONMENT.parse(source)
+    own = {name.name for name in tree.find_all(nodes.Name) if name.ctx == "store"}  # also those set in one branch only
+    unknown = sorted(meta.find_undeclared_variables(tree) - set(slots) - own)
     return unknown[0] if unknown else None
 
 

@@ -448,9 +448,12 @@ def test_a_users_own_prompts_are_checked(tmp_path: Path, two_rooms: str) -> None
     client = MockClient(script)
     decide_in(imagenav(two_rooms), VLM(client, prompts=tmp_path))
     assert words(client.calls[0]).startswith("Walk 5 steps!")
+    file.write_text("{% if look_ahead_action_num > 1 %}{% set many = 's' %}{% endif %}Walk step{{ many }}!")
+    assert Prompts(tmp_path).render("imagenav", "planner", **SLOTS) == "Walk steps!"
     for source, said in (
         ("{{ goal_colour }}", "unknown slot 'goal_colour'; the slots are obs_key"),
         ("{{ actions.fly.high }}", "UndefinedError"),
+        ("{% if look_ahead_action_num > 9 %}{% set many = 's' %}{% endif %}{{ many }}", "UndefinedError"),
         ("{% if %}", "TemplateSyntaxError"),
         ("{{ look_ahead_action_num / 0 }}", "ZeroDivisionError"),
         ("{{ obs_key.__class__.__mro__ }}", "SecurityError"),

@@ -314,7 +314,7 @@ def test_prices_come_from_a_file(tmp_path: Path) -> None:
         prices.compute_cost("big", 1_000_000, 100_000) == pytest.approx(3.5)
         and prices.compute_cost("small", 1, 1) is None
     )
-    for wrong in ("big: 3", "- big", "big: [1, x]", "{", ""):
+    for wrong in ("big: 3", "- big", "big: [1, x]", "big: [1, -2]", "big: [.nan, 1]", f"big: [1, {10**400}]", "{", ""):
         path.write_text(wrong)
         with pytest.raises(FileError, match="dollars per million tokens"):
             Prices.load(path)
