@@ -159,9 +159,10 @@ def make_plan(data: Path, settings: ScalingSettings) -> ScalingPlan:
 
     Raises:
         ArgumentError: the dataset has too few clips or scenes, or a scene of the decisions among those to train on.
-        FileError: the dataset is missing or damaged.
+        FileError: the dataset is missing, incomplete or damaged.
     """
     trained, held_out = (NavigationData(data, part, settings.held_out) for part in ("train", "held-out"))
+    trained.require_files()
     require_panoramas("data-scaling", NavigationCorpus(trained, "train"))
     if not trained.meta["config"]["depth"]:
         raise ArgumentError(

@@ -88,16 +88,18 @@ def train_on_clips(
             warpnet, without depth; too few clips; a state of a training with other data or numbers; or validation or
             decisions on scenes that are trained on or not there.
         TrainingError: the loss is not finite; the last good state is kept, the message names the batch.
-        FileError: the dataset is missing or damaged, or a file cannot be written.
+        FileError: the dataset is missing, incomplete or damaged, or a file cannot be written.
         DeviceMemoryError: memory does not suffice.
         DependencyError: torch or safetensors is not installed.
     """
     learner, device = make_learner(name), resolve_device(device)
 
     def open_part(folder: str | Path, wanted: Part) -> NavigationCorpus:
-        found = NavigationCorpus(NavigationData(folder, wanted, recipe.held_out), wanted)
-        require_panoramas(name, found)
-        return found
+        found = NavigationData(folder, wanted, recipe.held_out)
+        found.require_files()  # a clip in a file that is not whole may come up after hours
+        corpus = NavigationCorpus(found, wanted)
+        require_panoramas(name, corpus)
+        return corpus
 
     corpus = open_part(data, part)
     require_training_split(corpus)

@@ -513,6 +513,13 @@ def test_a_dataset_that_is_too_small_says_so(dataset: Path) -> None:
         wiw.data_scaling(None)
 
 
+def test_a_dataset_without_one_of_its_files_is_refused(dataset: Path, tmp_path: Path) -> None:
+    lacking = shutil.copytree(dataset, tmp_path / "data")
+    next(lacking.glob("data/*.parquet")).unlink()
+    with pytest.raises(FileError, match=r"\.parquet is missing; copy it again"):
+        make_plan(lacking, SETTINGS)
+
+
 def test_decisions_in_scenes_that_are_trained_on_are_refused(dataset: Path) -> None:
     trained, held_out = (
         NavigationData(dataset, part, SETTINGS.held_out).segments[0]["scene"] for part in ("train", "held-out")

@@ -311,6 +311,16 @@ def test_the_command_trains_measures_and_is_run(
     assert log.store.info["built"]["pocket"]["model"]["digest"] == Pocket(out).describe()["digest"]
 
 
+def test_a_dataset_with_a_file_cut_short_is_refused_before_training(dataset: Path, tmp_path: Path) -> None:
+    cut = shutil.copytree(dataset, tmp_path / "cut")
+    path = next(cut.glob("data/*.parquet"))
+    path.write_bytes(path.read_bytes()[:-9])
+    out, recipe = tmp_path / "pocket.safetensors", PocketRecipe(frames=4, rate=1e-3)
+    with pytest.raises(FileError, match=rf"{path.name}: expected \d+ bytes, as in meta.json"):
+        train_on_clips("pocket", cut, out, tmp_path / "cache", recipe)
+    assert not out.exists()
+
+
 @pytest.mark.parametrize(("given", "seed"), [([], 5), (["--seed", "0"], 0), (["--seed", "3"], 3)])
 def test_a_seed_replaces_that_of_the_recipe_file(
     given: list[str], seed: int, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
