@@ -145,7 +145,7 @@ def _read(folder: Path, device: str) -> tuple[str, dict[str, Any]]:
             f"LPIPS: {' and '.join(absent)} not found in {folder}. It needs two published files there, {BACKBONE.name} "
             f"({BACKBONE.size}) and {HEADS.name} ({HEADS.size}, also in the lpips package as "
             f"lpips/weights/v0.1/{HEADS.name}):\n  curl -L --create-dirs --output-dir {folder} -O {BACKBONE.url} -O "
-            f"{HEADS.url}"
+            f"{HEADS.url}\nWhere only Python packages can be fetched, see docs/quality.md"
         )
     for file in files:
         _require_published(folder / file.name, file)
