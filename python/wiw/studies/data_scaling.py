@@ -162,7 +162,6 @@ def make_plan(data: Path, settings: ScalingSettings) -> ScalingPlan:
         FileError: the dataset is missing, incomplete or damaged.
     """
     trained, held_out = (NavigationData(data, part, settings.held_out) for part in ("train", "held-out"))
-    trained.require_files()
     require_panoramas("data-scaling", NavigationCorpus(trained, "train"))
     if not trained.meta["config"]["depth"]:
         raise ArgumentError(

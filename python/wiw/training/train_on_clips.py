@@ -95,11 +95,9 @@ def train_on_clips(
     learner, device = make_learner(name), resolve_device(device)
 
     def open_part(folder: str | Path, wanted: Part) -> NavigationCorpus:
-        found = NavigationData(folder, wanted, recipe.held_out)
-        found.require_files()  # a clip in a file that is not whole may come up after hours
-        corpus = NavigationCorpus(found, wanted)
-        require_panoramas(name, corpus)
-        return corpus
+        found = NavigationCorpus(NavigationData(folder, wanted, recipe.held_out), wanted)
+        require_panoramas(name, found)
+        return found
 
     corpus = open_part(data, part)
     require_training_split(corpus)

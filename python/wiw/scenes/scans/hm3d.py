@@ -7,7 +7,6 @@ the table is `id,RRGGBB,"category",region`; id 0 is unknown.
 
 from __future__ import annotations
 
-import csv
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -29,6 +28,7 @@ from wiw.scenes.scans.scan import (
     require_file,
     require_folder,
     require_scans,
+    split_cells,
     to_y_up,
 )
 
@@ -77,11 +77,7 @@ def read_annotations(path: Path) -> Annotations:
     if not lines or HEADER not in lines[0]:
         raise FileError(f"{path}: expected '{HEADER}' in the first line, got {lines[0] if lines else ''!r:.60}")
     table = Annotations({}, {})
-    try:
-        rows = list(csv.reader(lines[1:]))
-    except csv.Error as error:
-        raise FileError(f"{path}: not a table of comma-separated values: {error}") from error
-    for number, row in enumerate(rows, 2):
+    for number, row in enumerate(split_cells(path, lines[1:]), 2):
         if not row:
             continue
         try:

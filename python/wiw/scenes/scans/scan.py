@@ -3,6 +3,7 @@
 
 from __future__ import annotations
 
+import csv
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -132,6 +133,18 @@ def read_text(path: Path, most_bytes: int = 256 << 20) -> str:
         return path.read_text(encoding="utf-8", errors="replace")
     except OSError as error:
         raise FileError(f"{path}: {error.strerror or error}") from error
+
+
+def split_cells(path: Path, lines: Iterable[str]) -> list[list[str]]:
+    """Return the cells of lines of comma-separated values.
+
+    Raises:
+        FileError: they are damaged; names the file that they are from.
+    """
+    try:
+        return list(csv.reader(lines))
+    except csv.Error as error:
+        raise FileError(f"{path}: not a table of comma-separated values: {error}") from error
 
 
 def require_file(path: Path, why: str) -> Path:

@@ -8,7 +8,6 @@ dataset's default, else Y, as glTF has it.
 
 from __future__ import annotations
 
-import csv
 import glob
 import re
 from collections.abc import Mapping
@@ -32,6 +31,7 @@ from wiw.scenes.scans.scan import (
     require_folder,
     require_scans,
     rotation_of,
+    split_cells,
 )
 from wiw.scenes.scans.urdf import read_visuals
 
@@ -158,10 +158,8 @@ class Dataset:
         if not file.is_file():
             return {}
         self.read.append(file)
-        try:
-            rows = list(csv.DictReader(read_text(file).splitlines()))
-        except csv.Error as error:
-            raise FileError(f"{file}: not a table of comma-separated values: {error}") from error
+        header, *lines = split_cells(file, read_text(file).splitlines()) or [[]]
+        rows = [dict(zip(header, line, strict=False)) for line in lines]
         words = [(row.get("id", ""), row.get("main_category") or row.get("name") or "") for row in rows]
         return {name: category for name, category in words if name}
 

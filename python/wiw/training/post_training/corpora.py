@@ -121,9 +121,7 @@ def open_corpus(folder: str | Path, part: Part, held_out: float = 0.05) -> Corpu
     folder = Path(folder)
     if is_demonstrations(folder):
         return DemonstrationCorpus(Demonstrations(folder), part, held_out)
-    data = NavigationData(folder, part, held_out)
-    data.require_files()  # before weights are loaded: a clip in a file that is not whole may come up after hours
-    return NavigationCorpus(data, part)
+    return NavigationCorpus(NavigationData(folder, part, held_out), part)
 
 
 def require_training_split(corpus: Corpus) -> None:
@@ -161,6 +159,9 @@ class NavigationCorpus(Corpus):
         data: the segments.
         part: which of them they are.
         front: height and width of front views that are cut out of panoramas, as the loop does; None leaves panoramas.
+
+    Raises:
+        FileError: a file is missing or cut short, of which a clip might come up after hours of training.
     """
 
     space = PRIMITIVES
@@ -169,6 +170,7 @@ class NavigationCorpus(Corpus):
     data: NavigationData
 
     def __init__(self, data: NavigationData, part: Part, front: tuple[int, int] | None = None) -> None:
+        data.require_files()
         self.data, self.part = data, part
         panoramic = data.meta.get("camera", {}).get("projection") == "equirectangular"
         self._crop = front if panoramic else None
