@@ -98,8 +98,8 @@ class AgentFlags:
     tracker_option: Options = ()
     """An option of --tracker, such as weights=FOLDER for sam2; may be repeated."""
     vlm: Annotated[str | None, arg(metavar="URL")] = None
-    """For policy vlm: an OpenAI-compatible server, transformers:PATH, replay:RUN, or mock. Default:
-    http://localhost:8000/v1."""
+    """For policy vlm: an OpenAI-compatible server, remote:FOLDER (servers announced there), transformers:PATH,
+    replay:RUN, or mock. Default: http://localhost:8000/v1."""
     vlm_model: MaybeName = None
     """The model's name on the server, or a preset from `wiw list`; not needed if the server has only one model."""
     vlm_prices: Annotated[Path | None, arg(metavar="FILE")] = None

@@ -5,7 +5,6 @@ from __future__ import annotations
 
 import asyncio
 import os
-import platform
 import secrets
 import signal
 import sys
@@ -13,12 +12,11 @@ import time
 from contextlib import ExitStack
 from pathlib import Path
 from typing import Annotated, Any
-from urllib.parse import urlsplit
 
 from tyro.conf import Positional, arg
 
 from wiw.cli.options import Options
-from wiw.wire.address_book import ServerAddress, announce_server
+from wiw.wire.address_book import ServerAddress, announce_server, name_reachable
 
 SHOWN, LOGGED = 1.0, 10.0
 """Seconds between status lines, on a terminal and elsewhere."""
@@ -92,7 +90,8 @@ async def _live(server: Any, name: str, announce: Path | None, idle: float | Non
 
     def begin() -> None:
         if announce is not None:
-            announcing.enter_context(announce_server(_find_address(server), announce))
+            reached = ServerAddress(name_reachable(server.address), server.settings.token)
+            announcing.enter_context(announce_server(reached, announce))
         ready.set()
 
     serving = asyncio.ensure_future(server.run(begin))
@@ -120,14 +119,6 @@ async def _live(server: Any, name: str, announce: Path | None, idle: float | Non
         for task in beside:
             task.cancel()
         await asyncio.gather(*beside, return_exceptions=True)
-
-
-def _find_address(server: Any) -> ServerAddress:
-    """Return the address at which other machines reach a server: by this machine's name, unless it is local only."""
-    split = urlsplit(server.address)
-    everywhere = split.hostname in ("0.0.0.0", "::")
-    address = f"{split.scheme}://{platform.node()}:{split.port}" if everywhere else server.address
-    return ServerAddress(address, server.settings.token)
 
 
 async def _end_if_idle(server: Any, seconds: float, ready: asyncio.Event) -> None:

@@ -4,13 +4,23 @@
 from __future__ import annotations
 
 import os
+import secrets
+import signal
+import threading
 from contextlib import ExitStack
 from pathlib import Path
-from typing import Annotated, Any
+from typing import TYPE_CHECKING, Annotated, Any
 
 from tyro.conf import arg
 
-from wiw.wire.address_book import ServerAddress, announce_server
+from wiw.wire.address_book import ServerAddress, announce_server, name_reachable
+
+if TYPE_CHECKING:
+    from wiw.serving.vlm_server import VlmServer
+
+SIGNALS = (signal.SIGTERM, signal.SIGINT, signal.SIGUSR2)
+GLANCE = 1.0
+"""Seconds between two looks at whether a server has been idle for too long."""
 
 
 def serve_vlm(
@@ -20,6 +30,7 @@ def serve_vlm(
     port: Annotated[int, arg(metavar="N")] = 8000,
     token: Annotated[str | None, arg(metavar="SECRET")] = None,
     announce: Annotated[Path | None, arg(metavar="FILE")] = None,
+    idle: Annotated[float | None, arg(metavar="SECONDS")] = None,
     seed: Annotated[int, arg(metavar="N")] = 0,
 ) -> int:
     """Serve a vision-language model, with the API of OpenAI and vLLM, for tests.
@@ -29,27 +40,50 @@ def serve_vlm(
 
     Then, in another terminal:  wiw run ar --policy vlm --vlm http://localhost:8000/v1
 
+    $ wiw serve-vlm --model PATH --host 0.0.0.0 --port 0 --announce servers/1.json --idle 1800
+    $ wiw run ar --policy vlm --vlm remote:servers
+
+    It exits on SIGTERM or Ctrl-C. Clients repeat what it has not answered, at another announced server if there is one.
+
     Args:
         model: tiny, a model with random weights, built on the spot; mock, with random answers; a folder or hub name for
             transformers; or a function that takes a call and returns a text, or a probability for each first token.
         host: Address to listen on; any but the loopback address requires a token.
         port: Port to listen on; 0 picks a free one.
         token: Secret that clients must send as OPENAI_API_KEY. Default: the environment variable WIW_TOKEN.
-        announce: File (.json) that announces address and token while the server is up.
+        announce: File (.json) that announces address and token while the server is up; clients are given its folder.
+            Only its owner can read it. Without --token a random one is used.
+        idle: Seconds without any request after which the server exits. Default: never.
         seed: Seed of the random weights.
     """
     import tempfile
 
     from wiw.serving.vlm_server import VlmServer
 
-    secret = token or os.environ.get("WIW_TOKEN")
-    with tempfile.TemporaryDirectory() as folder, ExitStack() as announcing:
-        server = VlmServer(_make_client(model, seed, folder), port, host, secret)
+    secret = token or os.environ.get("WIW_TOKEN") or (secrets.token_urlsafe() if announce is not None else None)
+    with (
+        tempfile.TemporaryDirectory() as folder,
+        VlmServer(_make_client(model, seed, folder), port, host, secret) as server,
+        ExitStack() as announcing,
+    ):
         print(f"{server.client.model} at {server.url}", flush=True)
         if announce is not None:
-            announcing.enter_context(announce_server(ServerAddress(server.url, secret), announce))
-        server.serve()
+            announcing.enter_context(announce_server(ServerAddress(name_reachable(server.url), secret), announce))
+        _wait_for_end(server, idle)
     return 0
+
+
+def _wait_for_end(server: VlmServer, idle: float | None) -> None:
+    """Wait until a signal arrives or the server has been idle for too long."""
+    ended = threading.Event()
+    before = {number: signal.signal(number, lambda *_: ended.set()) for number in SIGNALS}
+    try:
+        while not ended.wait(GLANCE if idle is None else min(GLANCE, idle / 4)):
+            if idle is not None and server.idle_seconds >= idle:
+                return
+    finally:
+        for number, handler in before.items():
+            signal.signal(number, handler)
 
 
 def _make_client(model: str, seed: int, folder: str) -> Any:

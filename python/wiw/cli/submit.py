@@ -5,6 +5,7 @@ from __future__ import annotations
 
 import math
 import shlex
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
@@ -25,8 +26,8 @@ if TYPE_CHECKING:
     from wiw.runs.recipes import AgentRecipe
 
 CLUSTER = ClusterConfig()
-SERVERS = "servers"
-"""Subfolder of the run's folder in which servers announce themselves."""
+SERVERS, VLM_SERVERS = "servers", "vlm-servers"
+"""Subfolders of the run's folder in which servers of the world model and the language model announce themselves."""
 IDLE = "1800"
 """Seconds without a client after which a server exits."""
 
@@ -50,6 +51,7 @@ def submit(
     $ wiw submit imagenav --arms none,warp --episodes 400 --shards 8 --partition cpu --out runs/a
     $ wiw submit imagenav --world-model svd --shards 4 --partition gpu --gpus 1 --minutes 720 --out runs/b
     $ wiw submit imagenav --world-model svd --shards 16 --partition cpu --servers 4 --server-partition gpu --out runs/d
+    $ wiw submit ar --policy vlm --vlm transformers:PATH --arms none,warp --shards 8 --vlm-servers 2 --out runs/e
     $ wiw submit imagenav --arms none,warp --episodes 8 --shards 2 --cluster local --out runs/c
     $ wiw status runs/a
     $ wiw merge runs/a --out runs/a
@@ -63,8 +65,8 @@ def submit(
     Args:
         task: See `wiw list`.
         shards: Number of shards of the episodes, one job each.
-        server_partition: SLURM partition for the jobs of --servers. Default: --partition. A server exits after half an
-            hour without a client.
+        server_partition: SLURM partition for the jobs of --servers and --vlm-servers. Default: --partition. A server
+            exits after half an hour without a client.
         jobs: What a job requests from the cluster.
         dry_run: Print the commands and submit nothing.
         parts: The agent.
@@ -82,29 +84,32 @@ def submit(
             raise ArgumentError(f"submit: --{name} is set for each job; leave it out")
     if config.served is not None:
         raise ArgumentError("submit: --servers always serve --world-model; --served is for --engine ray only")
-    if server_partition is not None and not config.servers:
-        raise ArgumentError("submit: --server-partition is for the jobs of --servers: give their number with it")
+    if server_partition is not None and not (config.servers or config.vlm_servers):
+        raise ArgumentError(
+            "submit: --server-partition is for the jobs of --servers and --vlm-servers: give their number with it"
+        )
     prepared = prepare_run(task, parts, arms, rules, search, replace(config, salt=_find_salt(config)))
     folder, count = Path(prepared.settings.out or ""), prepared.count
     Shard(1, shards).select(count)
     serving = _write_servers(folder, prepared, parts.world_model, jobs.cluster)
-    if serving:
+    if prepared.settings.servers:
+        asked = _name_servers(folder, SERVERS)
         parts, arms = (
-            replace(parts, world_model=_name_servers(folder), world_model_option=()),
-            _ask_servers(prepared, folder),
+            replace(parts, world_model=asked, world_model_option=()),
+            _ask_servers(prepared, asked),
         )
+    if prepared.settings.vlm_servers:
+        parts = replace(parts, vlm=_name_servers(folder, VLM_SERVERS))
     parted = [Shard(number, shards) for number in range(1, shards + 1)]
     commands = {shard: _write_command(task, arms, (parts, rules, search), prepared.settings, shard) for shard in parted}
     active = _require_alone(folder, [*serving, *commands.values()])
     left = [command for shard, command in commands.items() if not _is_done(folder / shard.folder)]
-    absent = [command for command in serving if left and tuple(command) not in active]
+    absent = {command: gpus for command, gpus in serving.items() if left and command not in active}
     for command in [*absent, *left]:
         print(shlex.join(["wiw", *command]))
     if left and not dry_run:
-        name = f"wiw-{folder.name}"
-        own = replace(jobs, gpus=math.ceil(config.server_gpus), partition=server_partition or jobs.partition)
-        begun = submit_commands(folder, absent, own, f"{name}-server") if absent else []
-        submitted = submit_commands(folder, left, jobs, name, begun)
+        begun = _submit_servers(folder, absent, replace(jobs, partition=server_partition or jobs.partition))
+        submitted = submit_commands(folder, left, jobs, _name_jobs(folder), begun)
         print(f"\njobs    {submitted[0].id} to {submitted[-1].id}, output in {folder / 'jobs'}")
     if not left:
         print("all shards have finished: there is nothing to submit")
@@ -144,8 +149,7 @@ def _write_command(
     """Return the command of a shard as arguments of `wiw`."""
     own = replace(
         settings,
-        servers=SETTINGS.servers,
-        server_gpus=SETTINGS.server_gpus,
+        **{name: getattr(SETTINGS, name) for name in ("servers", "server_gpus", "vlm_servers", "vlm_server_gpus")},
         shard=str(shard),
         out=Path(settings.out or "") / shard.folder,
         scratch=settings.scratch or "auto",
@@ -156,7 +160,7 @@ def _write_command(
     return ["run", task, *named, *(part for each in (*flags, own) for part in format_flags(each))]
 
 
-def _require_alone(folder: Path, commands: list[list[str]]) -> set[tuple[str, ...]]:
+def _require_alone(folder: Path, commands: Sequence[Sequence[str]]) -> set[tuple[str, ...]]:
     """Check that a run is submitted with the same commands as before and no job writes its shards; return active jobs.
 
     Raises:
@@ -186,36 +190,57 @@ def _explain_unknown(job: SubmittedJob, folder: Path) -> str:
     return f"; if this does not change and the jobs have ended (see squeue), remove {folder / FILE_NAME}"
 
 
-def _write_servers(folder: Path, prepared: PreparedRun, model: str, cluster: str) -> list[list[str]]:
-    """Return the commands of servers of the world model, with the options that the run gives it.
+def _write_servers(folder: Path, prepared: PreparedRun, model: str, cluster: str) -> dict[tuple[str, ...], float]:
+    """Return the commands of a run's servers, with the options that the run gives what they serve, and GPUs of each.
 
     Raises:
-        ArgumentError: there is no world model, no arm has it, or arms have it with different options.
+        ArgumentError: nothing is to be served, no arm has it, or arms have it with different options.
     """
-    from wiw.runs.servers import write_commands
+    from wiw.runs.servers import write_commands, write_vlm_commands
 
-    if not prepared.settings.servers:
-        return []
-    if model == "none":
+    settings = replace(prepared.settings, served=model if prepared.settings.servers else None)
+    if settings.servers and model == "none":
         raise ArgumentError("submit: --servers serve --world-model, but none is given; name one or omit --servers")
-    listen = ["--host", "127.0.0.1" if cluster == "local" else "0.0.0.0", "--port", "0", "--idle", IDLE]
-    return [
-        [*command.arguments, *listen, "--announce", str(folder / SERVERS / f"{number}.json")]
-        for command in write_commands(prepared.built, prepared.recipes, replace(prepared.settings, served=model))
+    kinds = {
+        SERVERS: write_commands(prepared.built, prepared.recipes, settings),
+        VLM_SERVERS: write_vlm_commands(prepared.recipes, settings),
+    }
+    listen = ("--host", "127.0.0.1" if cluster == "local" else "0.0.0.0", "--port", "0", "--idle", IDLE)
+    return {
+        (*command.arguments, *listen, "--announce", str(folder / place / f"{number}.json")): command.gpus
+        for place, commands in kinds.items()
+        for command in commands
         for number in range(1, command.count + 1)
-    ]
+    }
 
 
-def _name_servers(folder: Path) -> str:
-    return f"remote:{(folder / SERVERS).expanduser().resolve()}"
+def _submit_servers(
+    folder: Path, commands: Mapping[tuple[str, ...], float], config: ClusterConfig
+) -> list[SubmittedJob]:
+    """Submit the servers, one array for those with the same number of GPUs; return their jobs."""
+    from wiw.runs.submission import submit_commands
+
+    begun = []
+    for gpus in sorted({math.ceil(each) for each in commands.values()}):
+        own = [command for command, each in commands.items() if math.ceil(each) == gpus]
+        begun += submit_commands(folder, own, replace(config, gpus=gpus), f"{_name_jobs(folder)}-server")
+    return begun
 
 
-def _ask_servers(prepared: PreparedRun, folder: Path) -> str:
+def _name_jobs(folder: Path) -> str:
+    return f"wiw-{folder.name}"
+
+
+def _name_servers(folder: Path, place: str) -> str:
+    return f"remote:{(folder / place).expanduser().resolve()}"
+
+
+def _ask_servers(prepared: PreparedRun, served: str) -> str:
     """Return the arms of a run with its model replaced by the served one, under the same names.
 
     Arms of the model with another policy, repeated, or as a placebo or with an error, ask the servers too.
     """
-    own, served = str(prepared.agent.model), _name_servers(folder)
+    own = str(prepared.agent.model)
     named = zip(prepared.arms or [own], prepared.recipes.items(), strict=True)
     return ",".join(_ask_servers_for_arm(text, name, agent, own, served) for text, (name, agent) in named)
 

@@ -30,7 +30,8 @@ class EngineConfig(Engine):
     served: Annotated[str | None, arg(metavar="MODEL")] = None
     """World model of --arms that Ray actors serve. Default: --world-model."""
     vlm_servers: Annotated[int, arg(metavar="N")] = 0
-    """Number of servers of --vlm transformers:PATH (or mock), as Ray actors; workers are assigned to them in turn."""
+    """Number of servers of --vlm transformers:PATH (or mock) that all workers share: Ray actors, or jobs of `wiw
+    submit`."""
     vlm_server_gpus: Annotated[float, arg(metavar="N")] = 1
     """GPUs per server."""
 
@@ -106,8 +107,6 @@ class RunConfig(Limits, EngineConfig):
 
     def _require_use(self) -> None:
         """Check that every given setting has an effect."""
-        if self.engine != "ray" and self.vlm_servers:
-            raise ArgumentError("evaluate: vlm_servers require engine ray: give --engine ray (engine=)")
         if self.served is not None and not self.servers:
             raise ArgumentError(
                 "evaluate: served is the model that servers run: give their number with --servers (servers=)"

@@ -38,10 +38,11 @@ def require_servable(agents: Mapping[str, Any], config: EngineConfig) -> None:
     Raises:
         ArgumentError: servers without Ray or without a model, or for several models.
     """
-    if config.servers and config.engine != "ray":
+    if config.engine != "ray" and (config.servers or config.vlm_servers):
+        command, flag = ("serve", "world-model") if config.servers else ("serve-vlm", "vlm")
         raise ArgumentError(
             "evaluate: servers are Ray actors, or jobs of `wiw submit`: give --engine ray (engine=), or start `wiw "
-            "serve` and give its address as --world-model"
+            f"{command}` and give its address as --{flag}"
         )
     if config.servers:
         find_served(agents, config.served)

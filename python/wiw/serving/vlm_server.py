@@ -12,7 +12,8 @@ import json
 import socket
 import threading
 import time
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
 from dataclasses import dataclass, field
 from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
 from typing import Any
@@ -74,6 +75,7 @@ class VlmServer:
         self.serving = threading.local()
         """Its `connection` is the socket of the request that this thread serves."""
         self._asking, self._counting = threading.Lock(), threading.Lock()
+        self._in_flight, self._last_end = 0, time.monotonic()
         try:
             self._http = _Http((host, port), _Handler)
         except (OSError, OverflowError) as error:
@@ -86,14 +88,16 @@ class VlmServer:
         """Address for clients, as in "http://127.0.0.1:8000/v1"."""
         return f"http://{self._host}:{self._http.server_address[1]}/v1"
 
+    @property
+    def idle_seconds(self) -> float:
+        """Time since the last request; 0 while there is one."""
+        with self._counting:
+            return 0.0 if self._in_flight else time.monotonic() - self._last_end
+
     def start(self) -> VlmServer:
         """Serve in a thread."""
         threading.Thread(target=self._http.serve_forever, args=(0.05,), daemon=True, name="wiw serve-vlm").start()
         return self
-
-    def serve(self) -> None:
-        """Serve until it is interrupted."""
-        self._http.serve_forever()
 
     def stop(self) -> None:
         """End serving."""
@@ -132,6 +136,17 @@ class VlmServer:
             except Exception as error:
                 raise ModelFaultError(f"{type(error).__name__}: {error}") from error
         return completion
+
+    @contextmanager
+    def attend(self) -> Iterator[None]:
+        """Count a request as in flight as long as the context lasts."""
+        with self._counting:
+            self._in_flight += 1
+        try:
+            yield
+        finally:
+            with self._counting:
+                self._in_flight, self._last_end = self._in_flight - 1, time.monotonic()
 
     def count_request(self, body: dict[str, Any]) -> int:
         """Number a request and keep it."""
@@ -192,7 +207,8 @@ class _Handler(BaseHTTPRequestHandler):
         try:
             body = json.loads(data)
             server.serving.connection = self.connection
-            response = server.respond(body, server.count_request(body))
+            with server.attend():
+                response = server.respond(body, server.count_request(body))
             self._send(response.status, response.body, response.headers)
         except ClientGoneError:
             self.close_connection = True

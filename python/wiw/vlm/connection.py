@@ -16,8 +16,9 @@ def connect(spec: Any, **options: Any) -> Client:
     """Create the client for an address.
 
     Args:
-        spec: "http://host:port/v1" (any OpenAI-compatible server), "transformers:PATH" (a local model), "replay:RUN"
-            (answers recorded by a run), "mock" (random answers), or a client, which is returned as it is.
+        spec: "http://host:port/v1" (any OpenAI-compatible server), "remote:FOLDER" (those announced there),
+            "transformers:PATH" (a local model), "replay:RUN" (answers recorded by a run), "mock" (random answers), or a
+            client, which is returned as it is.
         options: of that client's class, such as `model`, `cache`, `prices`, `top_logprobs`.
 
     Raises:
@@ -35,7 +36,7 @@ def connect(spec: Any, **options: Any) -> Client:
 
 def _factory(spec: str) -> tuple[Any, tuple[str, ...]]:
     kind, _, rest = spec.partition(":")
-    if kind in ("http", "https"):
+    if kind in ("http", "https") or (kind == "remote" and rest):
         from wiw.vlm.openai import OpenAIClient
 
         return OpenAIClient, (spec,)
@@ -51,4 +52,6 @@ def _factory(spec: str) -> tuple[Any, tuple[str, ...]]:
         from wiw.vlm.mock import MockClient
 
         return partial(MockClient, record=False), ()
-    raise ArgumentError(f"vlm: expected http://HOST:PORT/v1, transformers:PATH, replay:RUN or mock, got '{spec}'")
+    raise ArgumentError(
+        f"vlm: expected http://HOST:PORT/v1, remote:FOLDER, transformers:PATH, replay:RUN or mock, got '{spec}'"
+    )

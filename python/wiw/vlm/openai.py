@@ -10,7 +10,7 @@ import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from concurrent.futures import FIRST_COMPLETED, CancelledError, Future, ThreadPoolExecutor, as_completed, wait
 from dataclasses import dataclass, replace
-from functools import cached_property
+from functools import partial
 from importlib import import_module
 from threading import Thread
 from typing import Any, Literal
@@ -20,6 +20,8 @@ from wiw.errors import ArgumentError, DependencyError, VlmError
 from wiw.vlm.base import Client
 from wiw.vlm.images import ImageFormat, to_data_uri
 from wiw.vlm.messages import Call, Completion, Message
+from wiw.vlm.servers import FIRM_REFUSALS, Servers
+from wiw.wire.address_book import ServerAddress
 
 Dialect = Literal["openai", "reasoning", "vllm", "legacy"]
 DIALECTS = ("openai", "reasoning", "vllm", "legacy")
@@ -29,6 +31,8 @@ MOST_OF_AN_ERROR = 1 << 16
 """Bytes of an error's body that are read."""
 LONGEST_WAIT = 60.0
 """Maximum wait in seconds before a request is sent again, whatever the server demands."""
+GLANCE = 5.0
+"""Maximum wait in seconds before it is seen whether a server has been announced."""
 REFUSED_LOGPROBS = (
     "; set top_logprobs= to the number of first tokens that the server lists, or to 0 to vote on choices instead"
 )
@@ -54,7 +58,8 @@ class OpenAIClient(Client):
     """Asks a server over HTTP.
 
     Args:
-        base_url: such as "http://localhost:8000/v1".
+        base_url: such as "http://localhost:8000/v1"; or "remote:FOLDER", where servers of one model announce
+            themselves (`wiw.vlm.servers`).
         model: its name there; None means the only one that the server offers.
         dialect: how choices and schemas are sent beside the prompt. "openai": `response_format`; "reasoning": the same,
             for hosted models that think first: the limit is `max_completion_tokens`, and no temperature is sent;
@@ -64,8 +69,9 @@ class OpenAIClient(Client):
         concurrency: maximum number of requests at a time.
         timeout: seconds that one request may take.
         attempts: times that it is sent in all while the server is busy or fails; how long it asks to wait is heeded.
+        patience: seconds in which it is sent again while no announced server can be reached, as weights are loaded.
         image_format: "png", or "jpeg" for slow connections.
-        key: the server's; None means `$OPENAI_API_KEY`.
+        key: the server's; None means `$OPENAI_API_KEY`. Announced servers announce their own.
         options: see `Client`.
 
     Raises:
@@ -82,6 +88,7 @@ class OpenAIClient(Client):
         concurrency: int = 8,
         timeout: float = 120.0,
         attempts: int = 4,
+        patience: float = 270.0,
         image_format: ImageFormat = "png",
         key: str | None = None,
         **options: Any,
@@ -92,15 +99,18 @@ class OpenAIClient(Client):
             raise ArgumentError(
                 f"vlm: expected dialect {', '.join(DIALECTS)}, image_format png or jpeg, got {dialect}, {image_format}"
             )
-        if concurrency < 1 or attempts < 1 or not timeout > 0 or thinking_tokens < 0:
+        if concurrency < 1 or attempts < 1 or not timeout > 0 or not patience >= 0 or thinking_tokens < 0:
             raise ArgumentError(
-                "vlm: expected concurrency, attempts and timeout above 0, and thinking_tokens of 0 or more, got "
-                f"{concurrency}, {attempts}, {timeout}, {thinking_tokens}"
+                "vlm: expected concurrency, attempts and timeout above 0, and thinking_tokens and patience of 0 or "
+                f"more, got {concurrency}, {attempts}, {timeout}, {thinking_tokens} and {patience}"
             )
         self.base_url, self.dialect, self.image_format = base_url, dialect, image_format
         self.thinking_tokens = thinking_tokens
         self.concurrency, self.timeout, self.attempts = concurrency, timeout, attempts
-        self._model, self._key = model, key
+        self._servers = Servers(base_url, key)
+        self.patience = patience if self._servers.are_announced else 0.0
+        self._model = model
+        self._sdks: dict[ServerAddress, Any] = {}
         self._given: dict[str, Any] = {
             "model": model,
             "dialect": dialect,
@@ -108,7 +118,8 @@ class OpenAIClient(Client):
             "concurrency": concurrency,
             "key": key,
         }
-        self._given |= {"timeout": timeout, "attempts": attempts, "image_format": image_format, **options}
+        self._given |= {"timeout": timeout, "attempts": attempts, "patience": patience, "image_format": image_format}
+        self._given |= options
 
     def __reduce__(self) -> Any:
         return _rebuild_client, (self.base_url, self._given)
@@ -121,7 +132,7 @@ class OpenAIClient(Client):
             VlmError: the server cannot be reached, or offers none or several.
         """
         if self._model is None:
-            names = [str(each.id) for each in self._ask_with_retries(lambda: list(self._sdk.models.list()))]
+            names = [str(each.id) for each in self._ask_with_retries(lambda sdk: list(sdk.models.list()))]
             if len(names) != 1:
                 raise VlmError(
                     f"{self.base_url} offers {', '.join(names) or 'no models'}; choose one with model=", "refused"
@@ -166,17 +177,23 @@ class OpenAIClient(Client):
                         images[id(part)] = to_data_uri(part, self.image_format)
         return [self._body(call, images) for call in calls]
 
-    @cached_property
-    def _sdk(self) -> Any:
+    def _find_sdk(self, server: ServerAddress) -> Any:
+        """Return the SDK's client of a server."""
+        if server not in self._sdks:
+            self._sdks[server] = self._make_sdk(server)
+        return self._sdks[server]
+
+    def _make_sdk(self, server: ServerAddress) -> Any:
         try:
             import openai
         except ImportError:
             raise DependencyError("OpenAI-compatible servers need openai: pip install 'wiw[vlm]'") from None
         import os
 
-        key = self._key or os.environ.get("OPENAI_API_KEY") or "none"
+        hosted = None if self._servers.are_announced else os.environ.get("OPENAI_API_KEY")
+        key = server.token or hosted or "none"
         http = openai.DefaultHttpxClient(event_hooks={"response": [self._cut_off]})
-        sdk = openai.OpenAI(base_url=self.base_url, api_key=key, timeout=self.timeout, max_retries=0, http_client=http)
+        sdk = openai.OpenAI(base_url=server.address, api_key=key, timeout=self.timeout, max_retries=0, http_client=http)
         if sdk.base_url.host != OPENAI_HOST:  # what the SDK reads from the environment is no business of others
             sdk.organization = sdk.project = None
         return sdk
@@ -213,14 +230,14 @@ class OpenAIClient(Client):
 
     def _request_completion(self, body: dict[str, Any], stopped: Future[None]) -> Completion:
         retries = _Retries()
-        completion = self._ask_with_retries(lambda: self._receive_completion(body), retries, stopped)
+        completion = self._ask_with_retries(lambda sdk: self._receive_completion(sdk, body), retries, stopped)
         return replace(completion, retries=retries.count)
 
-    def _receive_completion(self, body: dict[str, Any]) -> Completion:
+    def _receive_completion(self, sdk: Any, body: dict[str, Any]) -> Completion:
         """Send one request; read the body piece by piece, with limits on length and time."""
         until = time.monotonic() + self.timeout
         data = bytearray()
-        with self._sdk.chat.completions.with_streaming_response.create(**body) as response:
+        with sdk.chat.completions.with_streaming_response.create(**body) as response:
             for piece in _iterate_body(response):
                 data += piece
                 if len(data) > MOST_BYTES:
@@ -239,36 +256,48 @@ class OpenAIClient(Client):
         import openai
 
         retries, stopped = retries or _Retries(), stopped or Future()
+        give_up = time.monotonic() + self.patience
         while True:
+            server = None
             try:
-                return _run_within(self.timeout, work, stopped)
-            except openai.APIStatusError as error:
-                passing = error.status_code in _PASSING or error.status_code >= 500
-                said, kind = f"{error.status_code} {_shorten(error)}", "status" if passing else "refused"
-                pause = _read_retry_after(error)
-                if pause is None and error.status_code == _NO_QUOTA:
-                    pause = retries.pause_for_quota()
-            except (openai.APITimeoutError, TimeoutError) as error:
-                passing, said, kind, pause = (
-                    True,
-                    _shorten(error) or f"no answer within {self.timeout:g} s",
-                    "timeout",
-                    None,
-                )
-            except _NoCompletionError as error:
-                passing, said, kind, pause = True, _shorten(error), "protocol", None
-            except _BrokenOffError as error:
-                passing, said, kind, pause = True, _shorten(error), "unreachable", None
-            except openai.APIError as error:
-                passing, said, kind, pause = True, f"{type(error).__name__}: {_shorten(error)}", "unreachable", None
-            if not passing or retries.count + 1 >= self.attempts:
-                times = f"{retries.count + 1} tries" if retries.count else "1 try"
-                hint = _explain_refusal(said) if kind == "refused" else ""
-                hint = NOBODY_THERE if said.startswith("APIConnectionError") else hint
-                raise VlmError(f"{self.base_url}: {said} ({times}){hint}", kind)
-            if wait([stopped], min(LONGEST_WAIT, max(pause or 0.0, retries.pause()))).done:
+                server = self._servers.choose()
+                return _run_within(self.timeout, partial(work, self._find_sdk(server)), stopped)
+            except (openai.APIError, ConnectionError, TimeoutError, _NoCompletionError, _BrokenOffError) as error:
+                failure = self._read_failure(error, retries)
+            if server is not None and failure.kind in ("unreachable", "timeout"):
+                self._servers.pass_over(server)
+            may_return = failure.kind == "unreachable" and time.monotonic() < give_up
+            if not failure.is_passing or (retries.count + 1 >= self.attempts and not may_return):
+                raise self._make_error(failure, retries)
+            pause = max(failure.pause or 0.0, retries.pause())
+            if wait([stopped], min(GLANCE if may_return else LONGEST_WAIT, pause)).done:
                 raise CancelledError
             retries.count += 1
+
+    def _read_failure(self, error: Exception, retries: _Retries) -> _Failure:
+        """Return what an error says of the server."""
+        import openai
+
+        if isinstance(error, openai.APIStatusError):
+            said = f"{error.status_code} {_shorten(error)}"
+            if self._servers.are_announced and error.status_code in FIRM_REFUSALS:
+                return _Failure("unreachable", said)
+            pause = _read_retry_after(error)
+            if pause is None and error.status_code == _NO_QUOTA:
+                pause = retries.pause_for_quota()
+            is_passing = error.status_code in _PASSING or error.status_code >= 500
+            return _Failure("status" if is_passing else "refused", said, pause, is_passing)
+        if isinstance(error, openai.APITimeoutError | TimeoutError):
+            return _Failure("timeout", _shorten(error) or f"no answer within {self.timeout:g} s")
+        if isinstance(error, openai.APIError):
+            return _Failure("unreachable", f"{type(error).__name__}: {_shorten(error)}")
+        return _Failure("protocol" if isinstance(error, _NoCompletionError) else "unreachable", _shorten(error))
+
+    def _make_error(self, failure: _Failure, retries: _Retries) -> VlmError:
+        times = f"{retries.count + 1} tries" if retries.count else "1 try"
+        hint = _explain_refusal(failure.said) if failure.kind == "refused" else ""
+        hint = NOBODY_THERE if failure.said.startswith("APIConnectionError") else hint
+        return VlmError(f"{self.base_url}: {failure.said} ({times}){hint}", failure.kind)
 
 
 def _explain_refusal(said: str) -> str:
@@ -321,6 +350,19 @@ def _run_within(seconds: float, work: Callable[[], Any], stopped: Future[None]) 
     if not outcome.done():
         raise TimeoutError(f"the reply was not complete within {seconds:g} s")
     return outcome.result()
+
+
+@dataclass(frozen=True)
+class _Failure:
+    """A failed attempt of a request."""
+
+    kind: str
+    """As of `VlmError`."""
+    said: str
+    pause: float | None = None
+    """Seconds that the server asks to wait."""
+    is_passing: bool = True
+    """Whether it may succeed if it is sent again."""
 
 
 @dataclass

@@ -8,10 +8,12 @@ file; one that was killed leaves it, and clients try the next.
 from __future__ import annotations
 
 import json
+import platform
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
 from dataclasses import asdict, dataclass
 from pathlib import Path
+from urllib.parse import urlsplit, urlunsplit
 
 from wiw.files import atomic_file
 from wiw.json_text import parse_json
@@ -24,6 +26,14 @@ class ServerAddress:
     address: str
     """"ws://HOST:PORT", "wss://...", or of a language model "http://HOST:PORT/v1"."""
     token: str | None = None
+
+
+def name_reachable(address: str) -> str:
+    """Return an address with this machine's name in place of 0.0.0.0 or ::, at which others cannot ask it."""
+    split = urlsplit(address)
+    if split.hostname not in ("0.0.0.0", "::"):
+        return address
+    return urlunsplit(split._replace(netloc=f"{platform.node()}:{split.port}"))
 
 
 @contextmanager

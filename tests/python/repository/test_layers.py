@@ -50,7 +50,8 @@ FACES = {
 PYTHON_ROWS = [
     {"_core"},
     FACES,
-    {"datasets", "mapping", "metrics", "perception", "tabletop", "vlm", "wire"},
+    {"wire"},
+    {"datasets", "mapping", "metrics", "perception", "tabletop", "vlm"},
     {"envs", "judging", "policies", "scorers", "world_models"},
     {"isolation"},
     {"tasks", "loop", "training"},

@@ -23,7 +23,7 @@ import wiw
 from wiw.cli import main
 from wiw.errors import ArgumentError, InfrastructureError
 from wiw.runs import ray_servers
-from wiw.runs.config import EngineConfig, RunConfig
+from wiw.runs.config import EngineConfig
 from wiw.runs.part_options import parse_options
 from wiw.runs.recipes import AgentRecipe, TaskRecipe
 from wiw.runs.servers import _format_option, ask_servers, find_served, write_commands, write_vlm_commands
@@ -319,7 +319,7 @@ def test_servers_without_a_model_or_with_several_are_refused(tmp_path):
         find_served(other, "warp")
     with pytest.raises(ArgumentError, match="servers are Ray actors"):
         evaluate(TaskRecipe(TASK), AgentRecipe("heuristic", "warp"), 1, out=tmp_path / "run", servers=1)
-    with pytest.raises(ArgumentError, match="give --engine ray"):
-        RunConfig(vlm_servers=1)
+    with pytest.raises(ArgumentError, match=r"give --engine ray .*or start `wiw serve-vlm`"):
+        evaluate(TaskRecipe(TASK), AgentRecipe("heuristic"), 1, out=tmp_path / "run", vlm_servers=1)
     with pytest.raises(ArgumentError, match="one language model"):
         evaluate(TaskRecipe(TASK), AgentRecipe("heuristic"), 1, out=tmp_path / "run", engine="ray", vlm_servers=1)

@@ -23,7 +23,16 @@ from wiw.cli.parts import AgentFlags, TaskFlags
 from wiw.errors import ArgumentError, DependencyError, InfrastructureError, StoreError
 from wiw.loop.config import AgentConfig
 from wiw.runs.config import RunConfig
-from wiw.runs.submission import LOGS, ClusterConfig, JobCommand, cancel, find_states, read_jobs, submit_commands
+from wiw.runs.submission import (
+    LOGS,
+    ClusterConfig,
+    JobCommand,
+    SubmittedJob,
+    cancel,
+    find_states,
+    read_jobs,
+    submit_commands,
+)
 from wiw.studies.run_log import load_run
 
 submitit = pytest.importorskip("submitit", reason="needs submitit: pip install 'wiw[slurm]'")
@@ -218,6 +227,53 @@ def test_servers_are_jobs_that_all_shards_ask(tmp_path, two_rooms, capsys):
         submit(tmp_path / "other", "--servers", 1, "--debug")
 
 
+def test_servers_of_the_language_model_are_jobs_that_all_shards_ask(tmp_path, two_rooms, capsys):
+    """The answers are those of the model in the process of a run, though one of the two servers is killed at once."""
+    pytest.importorskip("openai", reason="needs wiw[vlm]")
+    out = tmp_path / "run"
+    asked = ["imagenav", "--scenes", two_rooms, "--policy", "vlm", "--vlm", "mock", "--episodes", 2, "--backend", "cpu"]
+    asked += ["--policy-option", "cache=off", "--salt", "", "--task-option", "decisions=1"]
+    jobs = ["--shards", 2, "--vlm-servers", 2, "--vlm-server-gpus", 0, "--cluster", "local", "--out", out]
+    assert main(["submit", *map(str, [*asked, *jobs])]) == 0
+    lines = [shlex.split(line)[1:] for line in capsys.readouterr().out.splitlines() if line.startswith("wiw ")]
+    assert [line[0] for line in lines] == ["serve-vlm", "serve-vlm", "run", "run"]
+    assert [line[line.index("--vlm") + 1] for line in lines[2:]] == [f"remote:{out}/vlm-servers"] * 2
+    assert not [part for line in lines[2:] for part in line if part.startswith("--vlm-server")]
+    first = read_jobs(out)[0]
+    os.kill(int(find_children(int(first.id))[0]), signal.SIGKILL)
+    ended = ["ENDED", "RUNNING", "ENDED", "ENDED"]
+    wait_for(lambda: [job.state for job in find_states(out)] == ended, 120)
+    assert main(["run", *map(str, asked), "--out", str(tmp_path / "whole"), "--no-report"]) == 0
+    assert wiw.merge([out], out).complete, logs(out)
+    one, other = load_run(out), load_run(tmp_path / "whole")
+    assert [row["status"] for row in one.episodes] == ["done", "done"]
+    assert [row["actions"] for row in one.decisions] == [row["actions"] for row in other.decisions]
+    assert len(cancel(out)) == 1
+    wait_for(have_jobs_ended(out))
+    assert not (out / "vlm-servers/2.json").exists()
+
+
+def test_servers_of_two_kinds_ask_for_their_own_gpus(tmp_path, monkeypatch):
+    """Each number of GPUs is an array of its own, and the shards, which need none, wait for all of them."""
+    arrays = []
+
+    def note(run, commands, config, name="wiw", after=()):
+        arrays.append(([command[0] for command in commands], config.gpus, config.partition, [job.id for job in after]))
+        return [SubmittedJob("slurm", f"{len(arrays)}_{place}", tuple(each)) for place, each in enumerate(commands)]
+
+    monkeypatch.setattr("wiw.runs.submission.submit_commands", note)
+    asked = ["--world-model", "warp", "--vlm", "mock", "--policy", "vlm", "--servers", 2, "--vlm-servers", 1]
+    asked += ["--vlm-server-gpus", 2, "--server-partition", "gpu", "--partition", "cpu", "--shards", 2]
+    assert main(["submit", "imagenav", *map(str, asked), "--out", str(tmp_path / "run")]) == 0
+    assert arrays == [
+        (["serve", "serve"], 1, "gpu", []),
+        (["serve-vlm"], 2, "gpu", []),
+        (["run", "run"], 0, "cpu", ["1_0", "1_1", "2_0"]),
+    ]
+    with pytest.raises(ArgumentError, match="vlm_servers: expected one language model"):
+        submit(tmp_path / "other", "--vlm-servers", 1, "--debug")
+
+
 def test_every_arm_of_the_served_model_asks_the_servers(tmp_path, capsys):
     out = tmp_path / "run"
     arms = "none,mine=warp?size=[36,64],reseeded:warp?size=[36,64],placebo-shuffled,heuristic+warp?size=[36,64]"
@@ -238,7 +294,7 @@ def test_every_arm_of_the_served_model_asks_the_servers(tmp_path, capsys):
 
 
 def test_a_partition_of_no_servers_is_refused(tmp_path):
-    with pytest.raises(ArgumentError, match="--server-partition is for the jobs of --servers"):
+    with pytest.raises(ArgumentError, match="--server-partition is for the jobs of --servers and --vlm-servers"):
         submit(tmp_path / "run", "--server-partition", "gpu", "--debug")
 
 

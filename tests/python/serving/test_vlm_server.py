@@ -38,6 +38,7 @@ from wiw.vlm import Request, connect, user  # noqa: E402
 from wiw.vlm.cache import ReplyCache  # noqa: E402
 from wiw.vlm.mock import MockClient  # noqa: E402
 from wiw.vlm.openai import _Retries  # noqa: E402
+from wiw.wire.address_book import ServerAddress, announce_server, read_addresses  # noqa: E402
 
 SECRET_HEADERS = ("OpenAI-Organization", "OpenAI-Project")
 IMAGE = np.random.default_rng(0).integers(0, 256, (40, 60, 3), np.uint8)
@@ -380,7 +381,7 @@ def test_what_is_of_openai_is_told_to_openai_alone(monkeypatch: pytest.MonkeyPat
     monkeypatch.setenv("OPENAI_ORG_ID", "org-mine")
     monkeypatch.setenv("OPENAI_PROJECT_ID", "project-mine")
     for url, told in (("https://api.openai.com/v1", True), ("http://127.0.0.1:8000/v1", False)):
-        headers = connect(url, model="m")._sdk.default_headers
+        headers = connect(url, model="m")._make_sdk(ServerAddress(url)).default_headers
         assert [headers.get(name) in ("org-mine", "project-mine") for name in SECRET_HEADERS] == [told, told]
 
 
@@ -686,18 +687,81 @@ def test_a_server_with_a_token_answers_nobody_without_it(monkeypatch: pytest.Mon
         assert connect(server.url, attempts=1).model == "mock"
 
 
-def test_the_command_announces_where_it_serves(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_the_command_announces_where_it_serves_and_ends_when_nobody_asks(tmp_path: Path) -> None:
     from wiw.cli import main
-    from wiw.wire.address_book import read_addresses
 
     found: list[Any] = []
     file = tmp_path / "server.json"
 
-    def look(server: VlmServer) -> None:
-        found.extend([*read_addresses(file), server.token, server.url])
-        server._http.server_close()
+    def look() -> None:
+        client = connect(f"remote:{file}", patience=20)
+        found.extend([client.model, *read_addresses(file), file.stat().st_mode & 0o777])
+        for _ in range(6):  # it is not idle meanwhile
+            time.sleep(0.2)
+            found.append(client.ask([REQUESTS[0]])[0].problem)
 
-    monkeypatch.setattr(VlmServer, "serve", look)
-    assert main(["serve-vlm", "--model", "mock", "--port", "0", "--token", "secret", "--announce", str(file)]) == 0
-    address, token, url = found
-    assert (address.address, address.token, token) == (url, "secret", "secret") and not file.exists()
+    looking = threading.Thread(target=look)
+    looking.start()
+    arguments = ["--model", "mock", "--port", "0", "--token", "secret", "--announce", str(file), "--idle", "1"]
+    before = signal.getsignal(signal.SIGTERM)
+    assert main(["serve-vlm", *arguments]) == 0
+    looking.join()
+    model, server, mode, *problems = found
+    assert (model, server.token, mode) == ("mock", "secret", 0o600) and server.address.startswith("http://127.0.0.1:")
+    assert problems == [None] * 6 and not file.exists() and signal.getsignal(signal.SIGTERM) == before
+
+
+def test_a_request_in_flight_keeps_a_server_from_being_idle() -> None:
+    gate, asked = threading.Event(), threading.Event()
+
+    def slow(call: Any) -> str:
+        asked.set()
+        gate.wait(20)
+        return "done"
+
+    with VlmServer(MockClient(slow)) as server, ThreadPoolExecutor(1) as pool:
+        waiting = pool.submit(connect(server.url, model="m").ask, [REQUESTS[2]])
+        assert asked.wait(20)
+        time.sleep(0.05)
+        assert server.idle_seconds == 0
+        gate.set()
+        waiting.result()
+        deadline = time.monotonic() + 20
+        while server.idle_seconds == 0:
+            assert time.monotonic() < deadline
+
+
+def test_the_next_announced_server_is_asked_when_one_is_lost(tmp_path: Path) -> None:
+    """Of three that are announced, one was killed, and of another one the port has a server with another token."""
+    folder = tmp_path / "servers"
+    folder.mkdir()
+    with pytest.raises(VlmError, match=f"no server is announced in {folder} yet") as error:
+        connect(f"remote:{folder}", patience=0, attempts=1).model  # noqa: B018
+    assert error.value.kind == "unreachable"
+    (folder / "0.json").write_text('{"address": "http://127.0.0.1:9/v1", "token": "killed"}')
+    with VlmServer(MockClient(), token="other") as other, VlmServer(MockClient(), token="first") as first:
+        (folder / "1.json").write_text(json.dumps({"address": other.url, "token": "of the killed one"}))
+        with announce_server(ServerAddress(first.url, "first"), folder / "2.json"):
+            client = connect(f"remote:{folder}", attempts=1)
+            expected = client.ask(REQUESTS[:1])[0].text
+            assert first.count == 1 and other.count == 0
+            client = pickle.loads(pickle.dumps(client))
+            assert client.ask(REQUESTS[:1])[0].text == expected and first.count == 2
+    with VlmServer(MockClient(), token="third") as third, ThreadPoolExecutor(1) as pool:
+        waiting = pool.submit(client.ask, REQUESTS[:1])
+        time.sleep(0.2)  # nobody is there yet
+        assert not waiting.done()
+        with announce_server(ServerAddress(third.url, "third"), folder / "2.json"):
+            assert waiting.result(60)[0].text == expected and third.count == 1
+    assert client.manner == f"png openai remote:{folder}", "wherever its servers are"
+
+
+def test_the_key_of_a_hosted_model_is_not_sent_to_announced_servers(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setenv("OPENAI_API_KEY", "mine")
+    with VlmServer(MockClient(), token="mine") as server:
+        assert connect(server.url, attempts=1).model == "mock"
+        (tmp_path / "1.json").write_text(json.dumps({"address": server.url}))
+        with pytest.raises(VlmError, match="401"):
+            connect(f"remote:{tmp_path}", attempts=1, patience=0).model  # noqa: B018
