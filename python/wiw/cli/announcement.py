@@ -31,7 +31,9 @@ def announce(task: Task, arms: Mapping[str, Any], config: RunConfig) -> None:
         recipe.describe()
         recipe.require(task, count)
     policies = sorted({str(recipe.policy) for recipe in arms.values()})
-    trials = f"{count_noun(count, 'episode')}{_describe_scenes(said, count)}"
+    trials = (
+        f"{count_noun(count, 'episode')}{_describe_scenes(said, count, getattr(task, 'block', said.get('per_scene')))}"
+    )
     lines = {
         "task": f"{said.get('task', task.name)}: {trials}, seed {config.seed}",
         "arms": f"{', '.join(arms)} ({'policy' if len(policies) == 1 else 'policies'} {', '.join(policies)})",
@@ -78,11 +80,11 @@ def count_noun(count: int, noun: str) -> str:
     return f"{count:,} {noun}{'' if count == 1 else 's'}"
 
 
-def _describe_scenes(task: Mapping[str, Any], episodes: int) -> str:
-    """Return where the episodes take place; empty for a task that does not say."""
+def _describe_scenes(task: Mapping[str, Any], episodes: int, each: int | None) -> str:
+    """Return where the episodes take place, `each` of them in a scene; empty for a task that does not say."""
     from wiw.scenes import resolve
 
-    file, spec, each = task.get("episode_file"), task.get("scenes"), task.get("per_scene")
+    file, spec = task.get("episode_file"), task.get("scenes")
     if file is not None:
         return f" of {file}"
     if spec is None:

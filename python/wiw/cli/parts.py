@@ -159,6 +159,9 @@ class AgentFlags:
 def _make_absolute(name: str, value: Any) -> str:
     """Return an option of policy vlm, made absolute if it is a path."""
     from wiw.policies.vlm.prompts.templates import SETS
+    from wiw.vlm.servers import ANNOUNCED
 
+    if name == "vlm" and str(value).startswith(ANNOUNCED):
+        return f"{ANNOUNCED}{Path(str(value).removeprefix(ANNOUNCED)).expanduser().resolve()}"
     is_path = isinstance(value, Path) or (name == "prompts" and value not in SETS)
     return str(Path(value).expanduser().resolve()) if is_path else str(value)

@@ -8,6 +8,7 @@ import secrets
 import signal
 import threading
 from contextlib import ExitStack
+from hashlib import blake2b
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
@@ -58,15 +59,13 @@ def serve_vlm(
     """
     import tempfile
 
-    from wiw.serving.vlm_server import VlmServer
-
     secret = token or os.environ.get("WIW_TOKEN") or (secrets.token_urlsafe() if announce is not None else None)
     with (
         tempfile.TemporaryDirectory() as folder,
-        VlmServer(_make_client(model, seed, folder), port, host, secret) as server,
+        _make_server(_make_client(model, seed, folder), port, host, secret) as server,
         ExitStack() as announcing,
     ):
-        print(f"{server.client.model} at {server.url}", flush=True)
+        print(f"{server.model} at {server.url}", flush=True)
         if announce is not None:
             announcing.enter_context(announce_server(ServerAddress(name_reachable(server.url), secret), announce))
         _wait_for_end(server, idle)
@@ -86,9 +85,18 @@ def _wait_for_end(server: VlmServer, idle: float | None) -> None:
             signal.signal(number, handler)
 
 
-def _make_client(model: str, seed: int, folder: str) -> Any:
-    from hashlib import blake2b
+def _make_server(client: Any, port: int, host: str, secret: str | None) -> VlmServer:
+    """Return the server of a model, whose name tells its weights: answers are kept by it, wherever it is served."""
+    from wiw.serving.vlm_server import VlmServer
+    from wiw.vlm.transformers import TransformersClient
 
+    if not isinstance(client, TransformersClient):
+        return VlmServer(client, port, host, secret)
+    digest = blake2b(client.manner.encode(), digest_size=4).hexdigest()
+    return VlmServer(client, port, host, secret, f"{client.model}-{digest}")
+
+
+def _make_client(model: str, seed: int, folder: str) -> Any:
     from wiw.registry import Registry
     from wiw.vlm.mock import MockClient
     from wiw.vlm.tiny import make_tiny

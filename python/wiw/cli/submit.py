@@ -39,6 +39,7 @@ def submit(
     shards: Annotated[int, arg(metavar="N")] = 8,
     server_partition: Annotated[str | None, arg(metavar="NAME")] = None,
     jobs: Annotated[ClusterConfig, arg(name="")] = CLUSTER,
+    retry_errors: bool = False,
     dry_run: bool = False,
     parts: Annotated[AgentFlags, arg(name="")] = AGENT,
     arms: Annotated[str | None, arg(metavar="[NAME=]MODEL[?KEY=VALUE],...")] = None,
@@ -68,6 +69,7 @@ def submit(
         server_partition: SLURM partition for the jobs of --servers and --vlm-servers. Default: --partition. A server
             exits after half an hour without a client.
         jobs: What a job requests from the cluster.
+        retry_errors: Also submit finished shards whose episodes include infrastructure errors, to run these again.
         dry_run: Print the commands and submit nothing.
         parts: The agent.
         arms: As for `wiw run`.
@@ -99,11 +101,15 @@ def submit(
             _ask_servers(prepared, asked),
         )
     if prepared.settings.vlm_servers:
+        if any(option.startswith("vlm=") for option in (*parts.policy_option, *parts.revision_option)):
+            raise ArgumentError(
+                "submit: --vlm-servers serve the language model of --vlm; name it there, not as an option"
+            )
         parts = replace(parts, vlm=_name_servers(folder, VLM_SERVERS))
     parted = [Shard(number, shards) for number in range(1, shards + 1)]
     commands = {shard: _write_command(task, arms, (parts, rules, search), prepared.settings, shard) for shard in parted}
     active = _require_alone(folder, [*serving, *commands.values()])
-    left = [command for shard, command in commands.items() if not _is_done(folder / shard.folder)]
+    left, errors = _list_left(folder, commands, retry_errors, str(prepared.settings.scratch or "auto"))
     absent = {command: gpus for command, gpus in serving.items() if left and command not in active}
     for command in [*absent, *left]:
         print(shlex.join(["wiw", *command]))
@@ -113,6 +119,8 @@ def submit(
         print(f"\njobs    {submitted[0].id} to {submitted[-1].id}, output in {folder / 'jobs'}")
     if not left:
         print("all shards have finished: there is nothing to submit")
+    if errors:
+        print(f"{errors} episodes ended with an error: once its cause is fixed, add --retry-errors to run them again")
     print(f"then    wiw status {folder}\n        wiw merge {folder} --out {folder}")
     return 0
 
@@ -168,14 +176,14 @@ def _require_alone(folder: Path, commands: Sequence[Sequence[str]]) -> set[tuple
     """
     from wiw.runs.submission import find_active, read_jobs
 
-    before = [job.arguments for job in read_jobs(folder)]
+    before = [job.arguments for job in read_jobs(folder) if job.arguments[0] != "resume"]
     if before and not {tuple(command) for command in commands} >= set(before):
         raise ArgumentError(
             f"submit: {folder} was submitted with other flags, such as: {shlex.join(['wiw', *before[-1]])}; give the "
             "same ones, or another --out"
         )
     active = find_active(folder)
-    if shards := [job for job in active if job.arguments[0] == "run"]:
+    if shards := [job for job in active if job.arguments[0] in ("run", "resume")]:
         raise ArgumentError(
             f"submit: job {shards[0].id} of {folder} is {shards[0].state} ({len(shards)} active in all); wait for "
             f"them, or `wiw cancel {folder}` first{_explain_unknown(shards[0], folder)}"
@@ -254,9 +262,21 @@ def _ask_servers_for_arm(text: str, name: str, agent: AgentRecipe, own: str, ser
     return f"{name}={arm.model.removesuffix(own)}{served}"  # options are the servers', equal in all arms
 
 
-def _is_done(shard: Path) -> bool:
-    """Return whether a shard has finished all its episodes."""
+def _list_left(
+    folder: Path, commands: Mapping[Shard, list[str]], retry_errors: bool, scratch: str
+) -> tuple[list[list[str]], int]:
+    """Return the commands of shards that are not finished, and how many episodes with an error they do not repeat."""
     from wiw.runs.status import status
     from wiw.runs.store_file import store_path
 
-    return store_path(shard).is_file() and all(store.state == "done" for store in status(shard).stores)
+    left, errors = [], 0
+    for shard, command in commands.items():
+        own = folder / shard.folder
+        (found,) = status(own).stores if store_path(own).is_file() else (None,)
+        if found is not None and found.errors and retry_errors:
+            left.append(["resume", str(own), "--retry-errors", "--scratch", scratch, "--no-report"])
+            continue
+        errors += 0 if found is None else found.errors
+        if found is None or found.state != "done":
+            left.append(command)
+    return left, errors

@@ -42,7 +42,7 @@ ERROR, ERROR_MODEL = "error-", "oracle"
 """Beginning of the names of arms with an error, and the model that they use where nobody names one."""
 REFERENCES = ("none", "copy", "oracle")
 """Arms that reports know by name: no world model, floor and ceiling."""
-ELSEWHERE = ("vlm", "cache", "prices", "concurrency", "timeout", "attempts")
+ELSEWHERE = ("vlm", "cache", "prices", "concurrency", "timeout", "attempts", "patience")
 """Options of a policy that change no answer: where and how its language model is asked."""
 NO_LIMITS = Limits()
 NOTHING: Mapping[str, Any] = {}

@@ -19,6 +19,8 @@ from wiw.world_models.remote.model import DEADLINE, ServedModel
 LOCAL_VLM = "transformers:"
 """Beginning of a language model that is in the process that asks it."""
 MOCK_VLM = "mock"
+IN_PROCESS = ("device", "dtype")
+"""Options of such a model that its servers do not take."""
 
 
 @dataclass(frozen=True)
@@ -84,17 +86,23 @@ def find_served_vlm(agents: Mapping[str, Any]) -> str:
     Raises:
         ArgumentError: none or several of them.
     """
-    found = {
-        str(options["vlm"])
+    asking = [
+        options
         for recipe in agents.values()
         if isinstance(recipe, AgentRecipe)
         for options in recipe.policy_options.values()
         if _is_local(options)
-    }
+    ]
+    found = {str(options["vlm"]) for options in asking}
     if len(found) != 1:
         raise ArgumentError(
             "vlm_servers: expected one language model that runs in the worker process, --vlm transformers:PATH or "
             f"mock, got {', '.join(sorted(found)) or 'none'}"
+        )
+    if own := sorted({name for options in asking for name in IN_PROCESS if name in options}):
+        raise ArgumentError(
+            f"vlm_servers: {' and '.join(own)} are for a model in the worker process; a server uses a GPU if it has "
+            "one, and the weights as they were saved: leave them out"
         )
     return found.pop()
 
@@ -146,7 +154,7 @@ def _ask_servers(
     if vlm is None:
         return recipe
     asked = {
-        policy: {**options, "vlm": vlm, "key": token} if _is_local(options) else options
+        policy: {"dialect": "vllm", **options, "vlm": vlm, "key": token} if _is_local(options) else options
         for policy, options in recipe.policy_options.items()
     }
     return replace(recipe, policy_options=asked)

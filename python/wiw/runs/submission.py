@@ -156,10 +156,11 @@ class JobCommand:
 
 def _has_run_all(arguments: Sequence[str]) -> bool:
     """Return whether all episodes of the run that a command writes have ended."""
-    if "--out" not in arguments:
+    before = "resume" if arguments[0] == "resume" else "--out"
+    if before not in arguments:
         return False
     try:
-        found = status(arguments[list(arguments).index("--out") + 1])
+        found = status(arguments[list(arguments).index(before) + 1])
     except StoreError:
         return False
     return all(store.state == "done" for store in found.stores)

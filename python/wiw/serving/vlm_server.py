@@ -16,6 +16,7 @@ from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import dataclass, field
 from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
+from itertools import count
 from typing import Any
 
 from wiw.errors import ArgumentError, Error
@@ -57,24 +58,28 @@ class VlmServer:
         port: 0 takes a free one; see `url`.
         host: address to listen on.
         token: secret that clients must send, as OpenAI's API key; required unless `host` is a loopback address.
+        model: name under which the model is served; None means the client's.
 
     Raises:
         ArgumentError: it cannot listen there, or others than this machine could ask it without a token.
     """
 
-    def __init__(self, client: Client, port: int = 0, host: str = "127.0.0.1", token: str | None = None) -> None:
+    def __init__(
+        self, client: Client, port: int = 0, host: str = "127.0.0.1", token: str | None = None, model: str | None = None
+    ) -> None:
         if not token and not is_loopback(host):
             raise ArgumentError(
                 f"serve-vlm: {host} can be reached from other machines: set WIW_TOKEN (or --token) to a secret that "
                 "clients send as OPENAI_API_KEY, such as the output of `openssl rand -hex 16`"
             )
         self.client, self.token = client, token or None  # an empty one is none: anybody could send it
+        self.model = client.model if model is None else model
         self.requests: list[dict[str, Any]] = []
         """Bodies of the latest 1000 requests, without their images' data."""
         self.count = 0
         self.serving = threading.local()
         """Its `connection` is the socket of the request that this thread serves."""
-        self._asking, self._counting = threading.Lock(), threading.Lock()
+        self._asking, self._counting = _Queue(), threading.Lock()
         self._in_flight, self._last_end = 0, time.monotonic()
         try:
             self._http = _Http((host, port), _Handler)
@@ -116,7 +121,7 @@ class VlmServer:
         Raises:
             Error: the request cannot be understood.
         """
-        return Response(200, make_chat_completion(self.complete(body), self.client.model, number))
+        return Response(200, make_chat_completion(self.complete(body), self.model, number))
 
     def complete(self, body: dict[str, Any]) -> Completion:
         """Return the completion of a request.
@@ -156,6 +161,24 @@ class VlmServer:
             return self.count - 1
 
 
+class _Queue:
+    """A lock that threads get in the order in which they come."""
+
+    def __init__(self) -> None:
+        self._changed = threading.Condition()
+        self._tickets, self._turn = count(), 0
+
+    def __enter__(self) -> None:
+        with self._changed:
+            own = next(self._tickets)
+            self._changed.wait_for(lambda: self._turn == own)
+
+    def __exit__(self, *_: object) -> None:
+        with self._changed:
+            self._turn += 1
+            self._changed.notify_all()
+
+
 class _Http(ThreadingHTTPServer):
     daemon_threads = True
     server: VlmServer
@@ -173,8 +196,10 @@ class _Handler(BaseHTTPRequestHandler):
         server: VlmServer = self.server.server  # type: ignore[attr-defined]
         if not self._is_welcome(server.token):
             return
+        with server.attend():
+            pass  # who asks what there is may ask more
         if self.path.rstrip("/") == "/v1/models":
-            models = [{"id": server.client.model, "object": "model", "created": 0, "owned_by": "wiw"}]
+            models = [{"id": server.model, "object": "model", "created": 0, "owned_by": "wiw"}]
             self._send(200, {"object": "list", "data": models})
         elif self.path == "/health":
             self._send(200, {})

@@ -9,18 +9,20 @@ import random
 import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from concurrent.futures import FIRST_COMPLETED, CancelledError, Future, ThreadPoolExecutor, as_completed, wait
+from contextlib import suppress
 from dataclasses import dataclass, replace
 from functools import partial
 from importlib import import_module
 from threading import Thread
 from typing import Any, Literal
 from urllib.parse import urlsplit, urlunsplit
+from weakref import ref
 
 from wiw.errors import ArgumentError, DependencyError, VlmError
 from wiw.vlm.base import Client
 from wiw.vlm.images import ImageFormat, to_data_uri
 from wiw.vlm.messages import Call, Completion, Message
-from wiw.vlm.servers import FIRM_REFUSALS, Servers
+from wiw.vlm.servers import UNKNOWN_TOKEN, Servers
 from wiw.wire.address_book import ServerAddress
 
 Dialect = Literal["openai", "reasoning", "vllm", "legacy"]
@@ -31,8 +33,8 @@ MOST_OF_AN_ERROR = 1 << 16
 """Bytes of an error's body that are read."""
 LONGEST_WAIT = 60.0
 """Maximum wait in seconds before a request is sent again, whatever the server demands."""
-GLANCE = 5.0
-"""Maximum wait in seconds before it is seen whether a server has been announced."""
+GLANCE, VISIT = 5.0, 300.0
+"""Seconds between two looks whether a server has been announced, at most, and between two visits that keep it up."""
 REFUSED_LOGPROBS = (
     "; set top_logprobs= to the number of first tokens that the server lists, or to 0 to vote on choices instead"
 )
@@ -61,13 +63,15 @@ class OpenAIClient(Client):
         base_url: such as "http://localhost:8000/v1"; or "remote:FOLDER", where servers of one model announce
             themselves (`wiw.vlm.servers`).
         model: its name there; None means the only one that the server offers.
-        dialect: how choices and schemas are sent beside the prompt. "openai": `response_format`; "reasoning": the same,
+        dialect: how choices and schemas are sent beside the prompt; None means "openai", but "vllm" for announced
+            servers, as `wiw serve-vlm` understands it. "openai": `response_format`; "reasoning": the same,
             for hosted models that think first: the limit is `max_completion_tokens`, and no temperature is sent;
             "vllm": `structured_outputs` too, for choices; "legacy": `guided_choice` and `guided_json` (vLLM before
             0.12).
         thinking_tokens: how many tokens a model of dialect "reasoning" may think with, beside those of its answer.
         concurrency: maximum number of requests at a time.
-        timeout: seconds that one request may take.
+        timeout: seconds that one request may take; None means 120, or for announced servers, at which many may wait,
+            600.
         attempts: times that it is sent in all while the server is busy or fails; how long it asks to wait is heeded.
         patience: seconds in which it is sent again while no announced server can be reached, as weights are loaded.
         image_format: "png", or "jpeg" for slow connections.
@@ -83,10 +87,10 @@ class OpenAIClient(Client):
         base_url: str,
         model: str | None = None,
         *,
-        dialect: Dialect = "openai",
+        dialect: Dialect | None = None,
         thinking_tokens: int = 8192,
         concurrency: int = 8,
-        timeout: float = 120.0,
+        timeout: float | None = None,
         attempts: int = 4,
         patience: float = 270.0,
         image_format: ImageFormat = "png",
@@ -95,6 +99,10 @@ class OpenAIClient(Client):
     ) -> None:
         super().__init__(**options)
         _refuse_credentials(base_url)
+        self._servers = Servers(base_url, key)
+        shared = self._servers.are_announced
+        dialect = ("vllm" if shared else "openai") if dialect is None else dialect
+        timeout = (600.0 if shared else 120.0) if timeout is None else timeout
         if dialect not in DIALECTS or image_format not in ("png", "jpeg"):
             raise ArgumentError(
                 f"vlm: expected dialect {', '.join(DIALECTS)}, image_format png or jpeg, got {dialect}, {image_format}"
@@ -107,8 +115,7 @@ class OpenAIClient(Client):
         self.base_url, self.dialect, self.image_format = base_url, dialect, image_format
         self.thinking_tokens = thinking_tokens
         self.concurrency, self.timeout, self.attempts = concurrency, timeout, attempts
-        self._servers = Servers(base_url, key)
-        self.patience = patience if self._servers.are_announced else 0.0
+        self.patience = patience if shared else 0.0
         self._model = model
         self._sdks: dict[ServerAddress, Any] = {}
         self._given: dict[str, Any] = {
@@ -180,6 +187,8 @@ class OpenAIClient(Client):
     def _find_sdk(self, server: ServerAddress) -> Any:
         """Return the SDK's client of a server."""
         if server not in self._sdks:
+            if self._servers.are_announced and not self._sdks:
+                Thread(target=_keep_server, args=(ref(self),), daemon=True, name="wiw vlm server").start()
             self._sdks[server] = self._make_sdk(server)
         return self._sdks[server]
 
@@ -269,10 +278,13 @@ class OpenAIClient(Client):
             may_return = failure.kind == "unreachable" and time.monotonic() < give_up
             if not failure.is_passing or (retries.count + 1 >= self.attempts and not may_return):
                 raise self._make_error(failure, retries)
-            pause = max(failure.pause or 0.0, retries.pause())
-            if wait([stopped], min(GLANCE if may_return else LONGEST_WAIT, pause)).done:
+            pause = retries.pause_for_server() if may_return else max(failure.pause or 0.0, retries.pause())
+            if wait([stopped], min(LONGEST_WAIT, pause)).done:
                 raise CancelledError
-            retries.count += 1
+            if may_return:
+                retries.waits += 1
+            else:
+                retries.count += 1
 
     def _read_failure(self, error: Exception, retries: _Retries) -> _Failure:
         """Return what an error says of the server."""
@@ -280,7 +292,7 @@ class OpenAIClient(Client):
 
         if isinstance(error, openai.APIStatusError):
             said = f"{error.status_code} {_shorten(error)}"
-            if self._servers.are_announced and error.status_code in FIRM_REFUSALS:
+            if self._servers.are_announced and error.status_code in UNKNOWN_TOKEN:
                 return _Failure("unreachable", said)
             pause = _read_retry_after(error)
             if pause is None and error.status_code == _NO_QUOTA:
@@ -298,6 +310,18 @@ class OpenAIClient(Client):
         hint = _explain_refusal(failure.said) if failure.kind == "refused" else ""
         hint = NOBODY_THERE if failure.said.startswith("APIConnectionError") else hint
         return VlmError(f"{self.base_url}: {failure.said} ({times}){hint}", failure.kind)
+
+
+def _keep_server(client: ref[OpenAIClient]) -> None:
+    """Ask an announced server for its models from time to time, so that it is not idle while a client is alive."""
+    while True:
+        time.sleep(VISIT)
+        asking = client()
+        if asking is None:
+            return
+        with suppress(Exception):  # another one will be looked for when there is a question
+            asking._find_sdk(asking._servers.choose()).models.list()
+        del asking
 
 
 def _explain_refusal(said: str) -> str:
@@ -370,10 +394,16 @@ class _Retries:
     """The number of failed attempts of a request."""
 
     count: int = 0
+    waits: int = 0
+    """Attempts while no announced server could be reached, which are not counted."""
 
     def pause(self) -> float:
         """Return the seconds to wait: doubling from a half, with jitter."""
         return float(0.5 * 2**self.count * (0.75 + 0.5 * random.random()))
+
+    def pause_for_server(self) -> float:
+        """Return the seconds until the announcements are looked at again."""
+        return min(GLANCE, 0.5 * 2 ** min(self.waits, 16))
 
     def pause_for_quota(self) -> float:
         """Return the seconds to wait where the server has no quota left and does not say for how long."""

@@ -4,6 +4,7 @@
 from __future__ import annotations
 
 import os
+import threading
 from contextlib import suppress
 from pathlib import Path
 
@@ -11,8 +12,8 @@ from wiw.wire.address_book import ServerAddress, read_addresses
 
 ANNOUNCED = "remote:"
 """Beginning of the address of servers that announce themselves, before their folder or file."""
-FIRM_REFUSALS = (401, 403, 404)
-"""Status codes of a server that is not the one announced: it does not know the token, or has no such path."""
+UNKNOWN_TOKEN = (401, 403)
+"""Status codes of a server that is not the one announced."""
 
 
 class Servers:
@@ -26,7 +27,7 @@ class Servers:
 
     def __init__(self, address: str, key: str | None) -> None:
         self._given = ServerAddress(address, key)
-        self._turn = os.getpid()  # clients spread over the servers
+        self._turn, self._turning = os.getpid(), threading.Lock()  # clients spread over the servers
 
     @property
     def are_announced(self) -> bool:
@@ -44,10 +45,14 @@ class Servers:
         place = self._given.address.removeprefix(ANNOUNCED)
         found = read_addresses(Path(place).expanduser())
         if not found:
-            raise ConnectionError(f"no server is announced in {place} yet")
+            raise ConnectionError(
+                f"no server is announced in {place} yet; start one (`wiw serve-vlm --announce`), or submit the run "
+                "again"
+            )
         return found[self._turn % len(found)]
 
     def pass_over(self, server: ServerAddress) -> None:
         """Note that a server is lost: the next one is asked, unless that has already been decided."""
-        with suppress(ConnectionError):
-            self._turn += server == self.choose()
+        with self._turning, suppress(ConnectionError):
+            if server == self.choose():
+                self._turn += 1

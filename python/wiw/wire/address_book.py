@@ -59,5 +59,7 @@ def read_addresses(place: Path) -> list[ServerAddress]:
     found = []
     for file in files:
         with suppress(OSError, ValueError, TypeError):  # gone just now, or no announcement
-            found.append(ServerAddress(**parse_json(file.read_text())))
+            server = ServerAddress(**parse_json(file.read_text()))
+            if isinstance(server.address, str) and isinstance(server.token, str | None):
+                found.append(server)
     return found

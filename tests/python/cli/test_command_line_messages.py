@@ -38,6 +38,8 @@ def test_a_run_announces_itself_before_it_does_anything(
         "workers 2",
         f"run     {tmp_path / 'r'}",
     ]
+    assert main(["run", "imagenav", "--tier", "all", "--preset", "foresight", *options, "--episodes", "31"]) == 130
+    assert "31 episodes in 3 of 4 scenes (apartments:val:4, 15 per scene)" in capsys.readouterr().err, "5 of each tier"
 
 
 @pytest.mark.parametrize(

@@ -228,7 +228,7 @@ def test_servers_are_jobs_that_all_shards_ask(tmp_path, two_rooms, capsys):
 
 
 def test_servers_of_the_language_model_are_jobs_that_all_shards_ask(tmp_path, two_rooms, capsys):
-    """The answers are those of the model in the process of a run, though one of the two servers is killed at once."""
+    """The answers are those of the model in the process of a run, though one of the two servers is killed."""
     pytest.importorskip("openai", reason="needs wiw[vlm]")
     out = tmp_path / "run"
     asked = ["imagenav", "--scenes", two_rooms, "--policy", "vlm", "--vlm", "mock", "--episodes", 2, "--backend", "cpu"]
@@ -239,8 +239,10 @@ def test_servers_of_the_language_model_are_jobs_that_all_shards_ask(tmp_path, tw
     assert [line[0] for line in lines] == ["serve-vlm", "serve-vlm", "run", "run"]
     assert [line[line.index("--vlm") + 1] for line in lines[2:]] == [f"remote:{out}/vlm-servers"] * 2
     assert not [part for line in lines[2:] for part in line if part.startswith("--vlm-server")]
-    first = read_jobs(out)[0]
-    os.kill(int(find_children(int(first.id))[0]), signal.SIGKILL)
+    wait_for((out / "vlm-servers/1.json").exists)
+    (task,) = find_children(int(read_jobs(out)[0].id))
+    (server,) = find_children(task)
+    os.kill(server, signal.SIGKILL)
     ended = ["ENDED", "RUNNING", "ENDED", "ENDED"]
     wait_for(lambda: [job.state for job in find_states(out)] == ended, 120)
     assert main(["run", *map(str, asked), "--out", str(tmp_path / "whole"), "--no-report"]) == 0
@@ -272,6 +274,29 @@ def test_servers_of_two_kinds_ask_for_their_own_gpus(tmp_path, monkeypatch):
     ]
     with pytest.raises(ArgumentError, match="vlm_servers: expected one language model"):
         submit(tmp_path / "other", "--vlm-servers", 1, "--debug")
+    asked = ["submit", "imagenav", "--revision", "vlm", "--vlm-servers", "1", "--out", str(tmp_path / "b"), "--debug"]
+    with pytest.raises(ArgumentError, match="name it there, not as an option"):
+        main([*asked, "--revision-option", "vlm=mock"])
+    with pytest.raises(ArgumentError, match="device and dtype are for a model in the worker process"):
+        main([*asked, "--vlm", "mock", "--revision-option", "dtype=bfloat16", "--revision-option", "device=cpu"])
+
+
+def test_shards_with_errors_are_submitted_again_when_asked(tmp_path, capsys):
+    out = tmp_path / "run"
+    assert submit(out, scenes="broken") == 0
+    wait_for(have_jobs_ended(out))
+    before = wiw.status(out)
+    assert (before.ended, before.errors) == (6, 1), logs(out)
+    assert submit(out, scenes="broken") == 0
+    assert "nothing to submit\n1 episodes ended with an error: once" in capsys.readouterr().out
+    assert submit(out, "--retry-errors", scenes="broken") == 0
+    lines = [shlex.split(line)[1:] for line in capsys.readouterr().out.splitlines() if line.startswith("wiw ")]
+    assert [line[:3] for line in lines] == [["resume", str(out / "shard-1-of-2"), "--retry-errors"]]
+    wait_for(have_jobs_ended(out))
+    after = wiw.status(out)
+    assert (after.ended, after.errors) == (6, 1) and after.stores[0].written > before.stores[0].written, logs(out)
+    assert after.stores[1].written == before.stores[1].written
+    assert submit(out, scenes="broken") == 0  # as before: retries are no other flags
 
 
 def test_every_arm_of_the_served_model_asks_the_servers(tmp_path, capsys):

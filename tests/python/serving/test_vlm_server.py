@@ -3,6 +3,7 @@
 
 from __future__ import annotations
 
+import gc
 import json
 import os
 import pickle
@@ -30,14 +31,16 @@ pydantic = pytest.importorskip("pydantic")
 pytest.importorskip("openai")
 
 from misbehaviour import FAULTS, MisbehavingVlmServer, Misbehaviour  # noqa: E402
-from wiw.cli.serve_vlm import _make_client  # noqa: E402
+from wiw.cli.serve_vlm import _make_client, _make_server  # noqa: E402
 from wiw.errors import ArgumentError, VlmError  # noqa: E402
 from wiw.serving import vlm_server  # noqa: E402
 from wiw.serving.vlm_server import VlmServer  # noqa: E402
 from wiw.vlm import Request, connect, user  # noqa: E402
+from wiw.vlm import openai as openai_client  # noqa: E402
 from wiw.vlm.cache import ReplyCache  # noqa: E402
 from wiw.vlm.mock import MockClient  # noqa: E402
 from wiw.vlm.openai import _Retries  # noqa: E402
+from wiw.vlm.servers import Servers  # noqa: E402
 from wiw.wire.address_book import ServerAddress, announce_server, read_addresses  # noqa: E402
 
 SECRET_HEADERS = ("OpenAI-Organization", "OpenAI-Project")
@@ -694,15 +697,18 @@ def test_the_command_announces_where_it_serves_and_ends_when_nobody_asks(tmp_pat
     file = tmp_path / "server.json"
 
     def look() -> None:
+        deadline = time.monotonic() + 60
+        while not file.exists() and time.monotonic() < deadline:
+            time.sleep(0.02)
         client = connect(f"remote:{file}", patience=20)
         found.extend([client.model, *read_addresses(file), file.stat().st_mode & 0o777])
         for _ in range(6):  # it is not idle meanwhile
-            time.sleep(0.2)
+            time.sleep(0.4)
             found.append(client.ask([REQUESTS[0]])[0].problem)
 
     looking = threading.Thread(target=look)
     looking.start()
-    arguments = ["--model", "mock", "--port", "0", "--token", "secret", "--announce", str(file), "--idle", "1"]
+    arguments = ["--model", "mock", "--port", "0", "--token", "secret", "--announce", str(file), "--idle", "2"]
     before = signal.getsignal(signal.SIGTERM)
     assert main(["serve-vlm", *arguments]) == 0
     looking.join()
@@ -753,7 +759,100 @@ def test_the_next_announced_server_is_asked_when_one_is_lost(tmp_path: Path) -> 
         assert not waiting.done()
         with announce_server(ServerAddress(third.url, "third"), folder / "2.json"):
             assert waiting.result(60)[0].text == expected and third.count == 1
-    assert client.manner == f"png openai remote:{folder}", "wherever its servers are"
+    assert client.manner == f"png vllm remote:{folder}", "wherever its servers are"
+
+
+def test_a_served_model_answers_as_it_does_in_the_process_that_asks(tmp_path: Path) -> None:
+    """With more choices than tokens are listed, the server too tells how likely each is."""
+    pytest.importorskip("torch")
+    pytest.importorskip("transformers")
+    from wiw.vlm.tiny import make_tiny
+    from wiw.vlm.transformers import TransformersClient
+
+    asked = [Request((user("Which?", IMAGE),), choices=tuple("abcdefghijkl"))]
+    names = []
+    for seed in (0, 1):
+        own = TransformersClient(make_tiny(tmp_path / f"step{seed}/model", seed), device="cpu", top_logprobs=5)
+        (expected,) = own.ask(asked)
+        with _make_server(own, 0, "127.0.0.1", "key") as server:
+            (tmp_path / "1.json").write_text(json.dumps({"address": server.url, "token": "key"}))
+            served = connect(f"remote:{tmp_path}", top_logprobs=5)
+            (found,) = served.ask(asked)
+            assert expected.raw is not None and (expected.raw > 0).all()
+            assert np.array_equal(found.raw, expected.raw)
+            names.append(served.model)
+    assert names[0] != names[1] and {name.partition("-")[0] for name in names} == {"model"}, "answers are kept by name"
+
+
+def test_waiting_for_a_server_uses_up_no_attempts(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(openai_client, "GLANCE", 0.01)
+    client = connect(f"remote:{tmp_path}", model="m", attempts=2)
+    with ThreadPoolExecutor(1) as pool:
+        waiting = pool.submit(client.ask, REQUESTS[2:3])
+        time.sleep(0.3)
+        tried = (failing({"500": 0.5}, seed=seed) for seed in range(100))
+        faults = next(each for each in tried if each.fault(0) and not each.fault(1))
+        with MisbehavingVlmServer(MockClient(), misbehaviour=faults) as server:
+            (tmp_path / "1.json").write_text(json.dumps({"address": server.url}))
+            (reply,) = waiting.result(60)
+    assert reply.problem is None and client.spent["vlm_retries"] == 1
+    assert _Retries(waits=100_000).pause_for_server() == 0.01
+
+
+def test_a_lost_server_is_passed_over_once_however_many_lose_it(tmp_path: Path) -> None:
+    for name in "012":
+        (tmp_path / f"{name}.json").write_text(json.dumps({"address": f"http://{name}/v1"}))
+    (tmp_path / "odd.json").write_text('{"address": 5}')
+    servers = Servers(f"remote:{tmp_path}", None)
+    first = servers.choose()
+    with ThreadPoolExecutor(8) as pool:
+        list(pool.map(lambda _: servers.pass_over(first), range(200)))
+    second = servers.choose()
+    servers.pass_over(first)
+    assert second != first and servers.choose() == second
+
+
+def test_an_announced_server_is_visited_as_long_as_there_is_a_client(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(openai_client, "VISIT", 0.05)
+    with VlmServer(MockClient()) as server:
+        (tmp_path / "1.json").write_text(json.dumps({"address": server.url}))
+        client = connect(f"remote:{tmp_path}")
+        assert client.model == "mock"
+        longest = 0.0
+        for _ in range(100):
+            time.sleep(0.01)
+            longest = max(longest, server.idle_seconds)
+        assert longest < 0.8
+        del client
+        gc.collect()
+        deadline = time.monotonic() + 30
+        while server.idle_seconds < 1:
+            assert time.monotonic() < deadline
+            time.sleep(0.05)
+
+
+def test_requests_are_answered_in_the_order_in_which_they_come() -> None:
+    gate, order = threading.Event(), []
+
+    def slow(call: Any) -> str:
+        gate.wait(20)
+        order.append(call.messages[0].content[0])
+        return "done"
+
+    with VlmServer(MockClient(slow)) as server, ThreadPoolExecutor(20) as pool:
+        client, waiting = connect(server.url, model="m"), []
+        for number in range(20):
+            waiting.append(pool.submit(client.ask, [Request((user(f"Say {number}"),))]))
+            deadline = time.monotonic() + 20
+            while server.count <= number:
+                assert time.monotonic() < deadline
+                time.sleep(0.002)
+            time.sleep(0.01)  # it is counted just before it has its turn
+        gate.set()
+        wait(waiting)
+    assert [text.split()[1] for text in order] == [str(number) for number in range(20)]
 
 
 def test_the_key_of_a_hosted_model_is_not_sent_to_announced_servers(
