@@ -4,7 +4,7 @@
 python tests/benchmark/pocket_held_out.py [--weights FILE] [--scenes SPEC] [--windows N] [--steps 1 2 4 25]
 
 Prints PSNR in dB by primitives ahead, in full size and at 64 x 128, and the control gap with its interval clustered by
-scene.
+scene. With `--picture FILE` it draws the first window straight ahead instead: true and imagined panoramas.
 """
 
 from __future__ import annotations
@@ -18,13 +18,20 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
+from PIL import Image, ImageDraw, ImageFont
 
 import wiw
 from wiw import scenes
 from wiw.analysis.intervals import clustered_interval
 from wiw.reproject import pose, warp
 from wiw.training.pocket.held_out import BASELINES, STEPS, Imagine, Window, draw_windows, imagine_by, measure
+from wiw.training.traversal import STEP_M
 from wiw.world_models.warpnet.model import turn_panorama
+
+PICTURED = (1, 3, 8)
+"""Numbers of primitives ahead that a picture shows."""
+WIDTH = 320
+"""Of a panorama in it, in pixels."""
 
 
 def warp_with_true_depth(window: Window, trajectory: NDArray[np.float64], seed: int) -> NDArray[np.uint8]:
@@ -45,15 +52,24 @@ def imagine_by_warpnet() -> Imagine:
     return imagine
 
 
+def make_models(options: argparse.Namespace) -> dict[str, Imagine]:
+    """Return the networks, and warp, by the names that are printed."""
+    weights = {"weights": options.weights} if options.weights else {}
+    pockets = {
+        f"pocket, {steps} {'step' if steps == 1 else 'steps'}": imagine_by(
+            wiw.world_model("pocket", steps=steps, **weights)
+        )
+        for steps in options.steps
+    }
+    return {**pockets, "warpnet": imagine_by_warpnet(), "warp": warp_with_true_depth}
+
+
 def measure_scenes(names: Sequence[str], options: argparse.Namespace) -> list[dict[str, Any]]:
     """Return the rows of some scenes, whose windows walk as another of theirs does where places are shuffled."""
     import torch
 
     torch.set_num_threads(1)
-    weights = {"weights": options.weights} if options.weights else {}
-    models: dict[str, Imagine] = {**BASELINES, "warpnet": imagine_by_warpnet(), "warp": warp_with_true_depth}
-    for steps in options.steps:
-        models[f"pocket, {steps} steps"] = imagine_by(wiw.world_model("pocket", steps=steps, **weights))
+    models: dict[str, Imagine] = {**BASELINES, **make_models(options)}
     windows = [window for name in names for window in draw_windows(name, options.windows, options.seed)]
     return list(measure(windows, models, options.seed))
 
@@ -83,6 +99,27 @@ def print_gap(rows: Sequence[Mapping[str, Any]], size: str) -> None:
         print(f"  {model:<18}{np.mean(gaps):6.2f} [{low:.2f}, {high:.2f}]")
 
 
+def draw_picture(scene: str, options: argparse.Namespace) -> None:
+    """Draw what is seen, and what was and would be seen farther ahead, a row for the truth and for each model."""
+    window = next(each for each in draw_windows(scene, 1, options.seed) if each.kind == "straight")
+    rows = {"truth": [window.truth[step] for step in PICTURED]}
+    for name, imagine in make_models(options).items():
+        frames = imagine(window, window.trajectory, options.seed)
+        rows[name] = [frames[step - 1] for step in PICTURED]
+    canvas = Image.new("RGB", (WIDTH // 3 + (1 + len(PICTURED)) * WIDTH, 20 + len(rows) * WIDTH * 9 // 16), "white")
+    draw, font = ImageDraw.Draw(canvas), ImageFont.load_default(13)
+    for column, step in enumerate((0, *PICTURED)):
+        metres = "seen" if step == 0 else f"{step * STEP_M:.1f} m ahead"
+        draw.text((WIDTH // 3 + column * WIDTH + 4, 4), metres, "black", font)
+    for row, (name, frames) in enumerate(rows.items()):
+        top = 20 + row * WIDTH * 9 // 16
+        draw.text((2, top + WIDTH // 4), name, "black", font)
+        for column, frame in enumerate([window.image, *frames]):
+            small = Image.fromarray(frame).resize((WIDTH - 4, WIDTH * 9 // 16 - 4), Image.Resampling.BOX)
+            canvas.paste(small, (WIDTH // 3 + column * WIDTH, top))
+    canvas.save(options.picture)
+
+
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--weights")
@@ -91,8 +128,12 @@ def main() -> None:
     parser.add_argument("--steps", type=int, nargs="+", default=[1, 2, 4, 25])
     parser.add_argument("--seed", type=int, default=0)
     parser.add_argument("--workers", type=int, default=2)
+    parser.add_argument("--picture", metavar="FILE")
     options = parser.parse_args()
     names = scenes.resolve(options.scenes)
+    if options.picture:
+        draw_picture(names[0], options)
+        return
     parts = [names[at :: options.workers] for at in range(options.workers)]
     with ProcessPoolExecutor(options.workers, mp_context=get_context("spawn")) as pool:
         rows = [row for found in pool.map(measure_scenes, parts, [options] * len(parts)) for row in found]
