@@ -30,7 +30,7 @@ from wiw.analysis.statistics import (
 )
 from wiw.analysis.summary import split_outcomes
 from wiw.experiments.errors.kinds import ERRORS
-from wiw.metrics.metric import ANSWER_SCORE, MEAN_TRAJECTORY, SUCCESS, Metric
+from wiw.metrics.metric import ANSWER_SCORE, MEAN_TRAJECTORY, PATH_LENGTH, SUCCESS, Metric
 
 REGRET = Metric("regret", "Regret", "length", False, least=0.0)
 """Score of the best true future less that of the chosen plan's, in the reviser's scores."""
@@ -42,6 +42,8 @@ STEP = 0.1
 """Distance that costs are given for."""
 MOST_MISSING = 0.1
 """Share of the oracle's episodes that an arm may lack to count among the costs of its family."""
+LENGTHS = (MEAN_TRAJECTORY, PATH_LENGTH)
+"""Of a trajectory; the first that a task records is shown."""
 FLOOR, CEILING = "none", "oracle"
 
 
@@ -60,8 +62,8 @@ class ErrorLine:
     """Arm minus oracle."""
     over_none: Difference | None
     """Arm minus none, paired: what is left of the gain of true futures. P is adjusted for all arms."""
-    actions: Difference | None
-    """The same in the number of actions."""
+    trajectory: Difference | None
+    """The same in the mean trajectory: number of executed actions, or in question answering metres."""
     regret: Difference | None
     """The same in regret."""
     measures: Mapping[str, Estimate]
@@ -271,7 +273,7 @@ def _summarise_arm(
         _estimate(done[arm], metric, seed),
         loss,
         compare(arm, FLOOR, done, metric, seed),
-        compare(arm, CEILING, done, MEAN_TRAJECTORY, seed),
+        next(filter(None, (compare(arm, CEILING, done, length, seed) for length in LENGTHS)), None),
         compare(arm, CEILING, done, REGRET, seed),
         measures,
     )

@@ -24,7 +24,7 @@ ABOUT: Mapping[str, str] = {
     "regret": "The reviser's score of the best true future minus that of the chosen plan's, minus the oracle's.",
     "n": "Episodes that are scored in the arm and in the oracle.",
     "n (regret)": "Episodes in which regret was measured in both; of costs, in all arms of the family.",
-    "actions": "Executed actions per episode, minus the oracle's.",
+    "mean traj": "Executed actions per episode, in question answering metres, minus the oracle's.",
     "1 - SSIM": "Dissimilarity of imagined and true frames, as the reviser sees them.",
     "LPIPS": "Perceptual distance of imagined and true views of 256x256 pixels.",
     "PSNR": "PSNR of imagined and true frames, dB; 100 for equal ones.",
@@ -45,7 +45,7 @@ def list_titles(table: ErrorTable) -> list[str]:
         "n",
         "regret",
         "n (regret)",
-        "actions",
+        "mean traj",
         *_list_measures(table),
     ]
 
@@ -177,7 +177,7 @@ def _show_line(line: ErrorLine, table: ErrorTable) -> list[str]:
         f"{line.loss.estimate.n}",
         _show_difference(line.regret, ".3f"),
         _count(line.regret.estimate if line.regret else None),
-        _show_difference(line.actions, ".1f"),
+        _show_difference(line.trajectory, ".1f"),
         *measures,
     ]
 

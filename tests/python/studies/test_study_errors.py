@@ -84,7 +84,7 @@ def test_every_arm_is_paired_with_the_oracle(table) -> None:
         assert (line.kind, line.family, line.dose) == (kind, ERRORS[kind].family, dose)
         assert line.loss.estimate.value == pytest.approx(-100 * COST[arm])
         assert line.regret.estimate.value == pytest.approx(2 * COST[arm])
-        assert line.actions.estimate.value == 5
+        assert line.trajectory.estimate.value == 5
         assert line.measures["1 - SSIM"].value == pytest.approx(DISTANCE[arm])
     assert found["error-lag@4"].loss.p_adjusted < 0.05 < found["error-blur@64"].loss.p_adjusted
 
@@ -92,11 +92,13 @@ def test_every_arm_is_paired_with_the_oracle(table) -> None:
 def test_answers_are_compared_by_their_scores() -> None:
     rows = outcomes()
     for row in rows:
-        row["metrics"] |= {"success": 0.0, "answer_score": 0.5 + row["metrics"]["success"] / 2}
+        metres = row["metrics"].pop("actions") / 10
+        row["metrics"] |= {"success": 0.0, "answer_score": 0.5 + row["metrics"]["success"] / 2, "path_length": metres}
     found = summarise_errors("aeqa", "explorer", rows, decisions(), ARMS, [])
     assert found.label == "Score" and found.references["none"].value == 50
     losses = {line.arm: line.loss.estimate.value for line in found.lines}
     assert losses == {arm: pytest.approx(-50 * COST[arm]) for arm in ARMS}
+    assert {line.trajectory.estimate.value for line in found.lines} == {0.5}, "metres"
 
 
 def test_costs_are_slopes_through_the_oracle(table) -> None:
