@@ -294,7 +294,8 @@ def test_commands_and_agents_of_servers():
     assert (command.arguments, command.count, command.gpus) == (("serve-vlm", "--model", "qwen"), 1, 1)
     asking = ask_servers(agents, "warp", ["ws://a", "ws://b"], "http://c/v1", "secret")
     assert asking["copy"] == agents["copy"]
-    assert asking["none"].policy_options["vlm"] == {"vlm": "http://c/v1", "tries": 2, "key": "secret"}
+    told = {"dialect": "vllm", "vlm": "http://c/v1", "tries": 2, "key": "secret"}  # so that choices reach the server
+    assert asking["none"].policy_options["vlm"] == told
     for arm in ("big", "placebo"):
         assert (asking[arm].model, asking[arm].placebo) == (ServedModel, agents[arm].placebo)
         assert asking[arm].model_options["address"] == "ws://a,ws://b"
