@@ -31,7 +31,7 @@ from wiw.world_models.warpnet.model import turn_panorama
 PICTURED = (1, 3, 8)
 """Numbers of primitives ahead that a picture shows."""
 WIDTH = 320
-"""Of a panorama in it, in pixels."""
+"""Width of a panorama in it, in pixels."""
 
 
 def warp_with_true_depth(window: Window, trajectory: NDArray[np.float64], seed: int) -> NDArray[np.uint8]:

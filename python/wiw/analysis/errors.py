@@ -43,7 +43,7 @@ STEP = 0.1
 MOST_MISSING = 0.1
 """Share of the oracle's episodes that an arm may lack to count among the costs of its family."""
 LENGTHS = (MEAN_TRAJECTORY, PATH_LENGTH)
-"""Of a trajectory; the first that a task records is shown."""
+"""Lengths of a trajectory; the first that a task records is shown."""
 FLOOR, CEILING = "none", "oracle"
 
 

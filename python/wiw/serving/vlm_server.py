@@ -197,14 +197,13 @@ class _Handler(BaseHTTPRequestHandler):
         if not self._is_welcome(server.token):
             return
         with server.attend():
-            pass  # who asks what there is may ask more
-        if self.path.rstrip("/") == "/v1/models":
-            models = [{"id": server.model, "object": "model", "created": 0, "owned_by": "wiw"}]
-            self._send(200, {"object": "list", "data": models})
-        elif self.path == "/health":
-            self._send(200, {})
-        else:
-            self._send(404, _error(f"no such path: {self.path}"))
+            if self.path.rstrip("/") == "/v1/models":
+                models = [{"id": server.model, "object": "model", "created": 0, "owned_by": "wiw"}]
+                self._send(200, {"object": "list", "data": models})
+            elif self.path == "/health":
+                self._send(200, {})
+            else:
+                self._send(404, _error(f"no such path: {self.path}"))
 
     def do_POST(self) -> None:
         server: VlmServer = self.server.server  # type: ignore[attr-defined]

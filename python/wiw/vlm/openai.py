@@ -49,6 +49,7 @@ NOBODY_THERE = (
     ": no server answers there; start one (docs/vlm.md), give another with --vlm URL, or use --vlm mock for a dry run "
     "without a model"
 )
+NONE_ANNOUNCED = "; start one (`wiw serve-vlm --announce`), or submit the run again"
 BROKEN = ("abort", "error", "cancelled")
 """Ends of a completion that the server broke off."""
 _NO_QUOTA = 429
@@ -309,6 +310,7 @@ class OpenAIClient(Client):
         times = f"{retries.count + 1} tries" if retries.count else "1 try"
         hint = _explain_refusal(failure.said) if failure.kind == "refused" else ""
         hint = NOBODY_THERE if failure.said.startswith("APIConnectionError") else hint
+        hint = NONE_ANNOUNCED if failure.said.startswith("no server is announced") else hint
         return VlmError(f"{self.base_url}: {failure.said} ({times}){hint}", failure.kind)
 
 

@@ -8,7 +8,7 @@ import threading
 from contextlib import suppress
 from pathlib import Path
 
-from wiw.wire.address_book import ServerAddress, read_addresses
+from wiw.wire.address_book import ServerAddress, choose_server
 
 ANNOUNCED = "remote:"
 """Beginning of the address of servers that announce themselves, before their folder or file."""
@@ -42,14 +42,7 @@ class Servers:
         """
         if not self.are_announced:
             return self._given
-        place = self._given.address.removeprefix(ANNOUNCED)
-        found = read_addresses(Path(place).expanduser())
-        if not found:
-            raise ConnectionError(
-                f"no server is announced in {place} yet; start one (`wiw serve-vlm --announce`), or submit the run "
-                "again"
-            )
-        return found[self._turn % len(found)]
+        return choose_server(Path(self._given.address.removeprefix(ANNOUNCED)).expanduser(), self._turn)
 
     def pass_over(self, server: ServerAddress) -> None:
         """Note that a server is lost: the next one is asked, unless that has already been decided."""

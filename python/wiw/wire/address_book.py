@@ -36,6 +36,18 @@ def name_reachable(address: str) -> str:
     return urlunsplit(split._replace(netloc=f"{platform.node()}:{split.port}"))
 
 
+def choose_server(place: Path, turn: int) -> ServerAddress:
+    """Return one of the servers that are announced in a file or folder; the next `turn` gives the next one.
+
+    Raises:
+        ConnectionError: none is announced.
+    """
+    servers = read_addresses(place)
+    if not servers:
+        raise ConnectionError(f"no server is announced in {place} yet")
+    return servers[turn % len(servers)]
+
+
 @contextmanager
 def announce_server(server: ServerAddress, file: Path) -> Iterator[None]:
     """Announce a server in a file as long as the context lasts.

@@ -738,7 +738,7 @@ def test_a_request_in_flight_keeps_a_server_from_being_idle() -> None:
 
 
 def test_the_next_announced_server_is_asked_when_one_is_lost(tmp_path: Path) -> None:
-    """Of three that are announced, one was killed, and of another one the port has a server with another token."""
+    """Three are announced: one was killed, and the port of another one has a server with another token."""
     folder = tmp_path / "servers"
     folder.mkdir()
     with pytest.raises(VlmError, match=f"no server is announced in {folder} yet") as error:

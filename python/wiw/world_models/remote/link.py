@@ -29,7 +29,7 @@ from websockets.exceptions import ConnectionClosed, InvalidStatus
 
 import wiw
 from wiw.errors import ContractError, RemoteError
-from wiw.wire.address_book import ServerAddress, read_addresses
+from wiw.wire.address_book import ServerAddress, choose_server
 from wiw.wire.loopback import is_loopback
 from wiw.wire.messages import MOST_BYTES, Answer, Ask, Hello, Refusal, Wait, Welcome, decode, encode
 from wiw.wire.rows import row_id
@@ -228,10 +228,7 @@ class Link:
     def _choose_server(self) -> ServerAddress:
         if "://" in self._given.address:
             return self._given
-        servers = read_addresses(Path(self._given.address))
-        if not servers:
-            raise ConnectionError(f"no server is announced in {self._given.address} yet")
-        return servers[self._turn % len(servers)]
+        return choose_server(Path(self._given.address), self._turn)
 
     async def _shake_hands(self, connection: ClientConnection) -> None:
         await connection.send(encode(Hello(f"wiw {wiw.__version__}")))
