@@ -4,8 +4,6 @@
 from __future__ import annotations
 
 import asyncio
-import os
-import secrets
 import signal
 import sys
 import time
@@ -16,7 +14,7 @@ from typing import Annotated, Any
 from tyro.conf import Positional, arg
 
 from wiw.cli.options import Options
-from wiw.wire.address_book import ServerAddress, announce_server, name_reachable
+from wiw.wire.address_book import ServerAddress, announce_server, find_token, name_reachable
 
 SHOWN, LOGGED = 1.0, 10.0
 """Seconds between status lines, on a terminal and elsewhere."""
@@ -74,7 +72,7 @@ def serve(
     from wiw.runs.part_options import parse_options
     from wiw.serving.server import Server, Settings
 
-    secret = token or os.environ.get("WIW_TOKEN") or (secrets.token_urlsafe() if announce is not None else None)
+    secret = find_token(token, announce)
     settings = Settings(host, port, secret, queue, window, certificate, key, grace)
     options = parse_options(world_model_option, WORLD_MODELS.find_here(model), "--world-model-option")
     server = Server(WORLD_MODELS.make_here(model, **options), settings)  # here: this process holds no simulator

@@ -3,8 +3,6 @@
 
 from __future__ import annotations
 
-import os
-import secrets
 import signal
 import threading
 from contextlib import ExitStack
@@ -14,7 +12,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 from tyro.conf import arg
 
-from wiw.wire.address_book import ServerAddress, announce_server, name_reachable
+from wiw.wire.address_book import ServerAddress, announce_server, find_token, name_reachable
 
 if TYPE_CHECKING:
     from wiw.serving.vlm_server import VlmServer
@@ -59,7 +57,7 @@ def serve_vlm(
     """
     import tempfile
 
-    secret = token or os.environ.get("WIW_TOKEN") or (secrets.token_urlsafe() if announce is not None else None)
+    secret = find_token(token, announce)
     with (
         tempfile.TemporaryDirectory() as folder,
         _make_server(_make_client(model, seed, folder), port, host, secret) as server,

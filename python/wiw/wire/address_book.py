@@ -8,7 +8,9 @@ file; one that was killed leaves it, and clients try the next.
 from __future__ import annotations
 
 import json
+import os
 import platform
+import secrets
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
 from dataclasses import asdict, dataclass
@@ -46,6 +48,11 @@ def choose_server(place: Path, turn: int) -> ServerAddress:
     if not servers:
         raise ConnectionError(f"no server is announced in {place} yet")
     return servers[turn % len(servers)]
+
+
+def find_token(given: str | None, announcement: Path | None) -> str | None:
+    """Return the secret of a server: the given one, that of the environment, or a random one if it is announced."""
+    return given or os.environ.get("WIW_TOKEN") or (secrets.token_urlsafe() if announcement is not None else None)
 
 
 @contextmanager
