@@ -31,9 +31,7 @@ def announce(task: Task, arms: Mapping[str, Any], config: RunConfig) -> None:
         recipe.describe()
         recipe.require(task, count)
     policies = sorted({str(recipe.policy) for recipe in arms.values()})
-    trials = (
-        f"{count_noun(count, 'episode')}{_describe_scenes(said, count, getattr(task, 'block', said.get('per_scene')))}"
-    )
+    trials = f"{count_noun(count, 'episode')}{_describe_scenes(said, count, task.block)}"
     lines = {
         "task": f"{said.get('task', task.name)}: {trials}, seed {config.seed}",
         "arms": f"{', '.join(arms)} ({'policy' if len(policies) == 1 else 'policies'} {', '.join(policies)})",

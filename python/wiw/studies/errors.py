@@ -94,7 +94,7 @@ class ErrorSettings:
 
     def list_arms(self, task: str) -> dict[str, tuple[str, float]]:
         """Return the kind and dose of each of a task's arms that have an error."""
-        space = getattr(task_class(task), "space", PRIMITIVES)
+        space = task_class(task).space
         found = [(kind, dose) for kind in self.kinds for dose in ERRORS[kind].doses.get(space, ())[-self.doses :]]
         return {f"{ERROR}{kind}@{dose:g}": (kind, dose) for kind, dose in found}
 
@@ -293,7 +293,7 @@ def _order_arms(arms: Mapping[str, tuple[str, float]]) -> list[str]:
 
 def make_recipes(task: str, settings: ErrorSettings) -> tuple[TaskRecipe, AgentRecipe]:
     """Return the recipes for a task's runs: the task, and the agent whose world model is the oracle."""
-    walks = getattr(task_class(task), "space", PRIMITIVES) == PRIMITIVES
+    walks = task_class(task).space == PRIMITIVES
     options: dict[str, Any] = {"seed": settings.seed}
     if walks:
         options |= {"per_scene": settings.per_scene}

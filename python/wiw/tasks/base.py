@@ -104,6 +104,11 @@ class Task(ABC):
         return 20
 
     @property
+    def block(self) -> int | None:
+        """Episodes generated in a scene at a time; None for a task whose episodes do not come scene by scene."""
+        return None
+
+    @property
     def decisions(self) -> int:
         """Number of decisions in an episode as far as known beforehand, for progress bars."""
         return 20
