@@ -66,6 +66,7 @@ class ProcessScorer:
         self._errors = tempfile.TemporaryFile()  # noqa: SIM115 - closed with the process
         self._process = _start(command, self._errors)
         self._failed = False
+        self._writer: threading.Thread | None = None
         self._lines: queue.Queue[bytes] = queue.Queue(MOST_WAITING)
         threading.Thread(target=_read_lines, args=(self._process.stdout, self._lines), daemon=True).start()
         try:
@@ -80,7 +81,8 @@ class ProcessScorer:
         Raises:
             ScorerError: it hangs, ends before all are scored, or answers anything but valid scores of what was asked.
         """
-        threading.Thread(target=_write_lines, args=(self._process.stdin, paths), daemon=True).start()
+        self._writer = threading.Thread(target=_write_lines, args=(self._process.stdin, paths), daemon=True)
+        self._writer.start()
         asked = {str(path): path for path in paths}
         answered: set[str] = set()
         while len(answered) < len(asked):
@@ -91,15 +93,21 @@ class ProcessScorer:
 
     def close(self) -> None:
         """End the process and all that it has started."""
-        with suppress(OSError):
-            if self._process.stdin is not None:
-                self._process.stdin.close()
+        if self._writer is None:
+            self._close_input()
         with suppress(subprocess.TimeoutExpired):
             self._process.wait(0 if self._failed else GRACE)
         with suppress(ProcessLookupError, PermissionError):
             os.killpg(self._process.pid, signal.SIGKILL)
         self._process.wait()
+        if self._writer is not None:  # closing the input sooner would wait for a write that nobody reads
+            self._writer.join(GRACE)
         self._errors.close()
+
+    def _close_input(self) -> None:
+        with suppress(OSError):
+            if self._process.stdin is not None:
+                self._process.stdin.close()
 
     def __enter__(self) -> ProcessScorer:
         return self
@@ -242,10 +250,10 @@ def _read_lines(stream: Any, lines: queue.Queue[bytes]) -> None:
 
 
 def _write_lines(stream: Any, paths: Sequence[Path]) -> None:
-    with suppress(ValueError, OSError):  # it has ended; what it answered says the rest
+    """Write paths, then close the stream, also where its reader has ended: what that answered says the rest."""
+    with suppress(OSError), stream:
         for path in paths:
             stream.write(f"{path}\n".encode())
-        stream.close()
 
 
 def _is_range(span: Any) -> bool:

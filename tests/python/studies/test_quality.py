@@ -260,6 +260,15 @@ def test_what_cannot_be_run_is_said(tmp_path: Path) -> None:
             make_scorer(spec)
 
 
+def test_a_scorer_that_reads_nothing_is_ended_at_its_deadline(tmp_path: Path) -> None:
+    """Its pipe is full, and the thread that writes to it waits."""
+    command = write_scorer(tmp_path, card=f"{CARD}''', flush=True); time.sleep(60); print('''")
+    began = time.monotonic()
+    with pytest.raises(ScorerError, match="no line"), ProcessScorer(command, 1.5) as scorer:
+        list(scorer.score([tmp_path / f"{number:060d}.png" for number in range(5000)]))
+    assert time.monotonic() - began < 30
+
+
 def test_a_hung_scorer_and_its_children_are_ended(tmp_path: Path, paths: list[Path]) -> None:
     child = (
         "import subprocess; c = subprocess.Popen(['sleep', '60']); print(c.pid, file=open('PID', 'w')); time.sleep(60)"
