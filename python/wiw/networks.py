@@ -70,13 +70,23 @@ def autocast_bfloat16(device: str, wanted: bool) -> torch.autocast:
     return torch.autocast(kind, torch.bfloat16, enabled=wanted and (kind != "cpu" or has_bfloat16()))
 
 
+def autocast_uncached(device: torch.device, wanted: bool) -> torch.autocast:
+    """Return a context that computes products in bfloat16 if `wanted`, and keeps no copies of weights in bfloat16.
+
+    Copies of all weights would last until the end of a pass, also those that sharding (FSDP2) frees after their use.
+    """
+    import torch
+
+    return torch.autocast(device.type, torch.bfloat16, enabled=wanted, cache_enabled=False)
+
+
 OUT_OF_MEMORY_WORDS = ("out of memory", "ALLOC_FAILED", "can't allocate memory")
 """Error texts of CUDA and its libraries where they allocate memory past torch's allocator, and of main memory."""
 
 
 @contextmanager
 def memory_guard(what: str, cures: str) -> Iterator[None]:
-    """Turn out-of-memory errors into one that says how to use less memory.
+    """Turn out-of-memory errors into one that says how to use less memory; of nested guards, the outermost says it.
 
     Raises:
         DeviceMemoryError: the memory is exhausted.
@@ -85,13 +95,21 @@ def memory_guard(what: str, cures: str) -> Iterator[None]:
 
     try:
         yield
-    except (RuntimeError, MemoryError) as error:
-        full = isinstance(error, torch.OutOfMemoryError | MemoryError)
-        if not full and not any(said in str(error) for said in OUT_OF_MEMORY_WORDS):
+    except (RuntimeError, MemoryError, DeviceMemoryError) as error:
+        if not is_out_of_memory(error):
             raise
         torch.cuda.empty_cache()
-        said = (str(error).splitlines() or ["out of memory"])[0]
-        raise DeviceMemoryError(f"{what} does not fit into the device's memory ({said}); {cures}") from error
+        cause = (error.__cause__ or error) if isinstance(error, DeviceMemoryError) else error
+        said = (str(cause).splitlines() or ["out of memory"])[0]
+        raise DeviceMemoryError(f"{what} does not fit into the device's memory ({said}); {cures}") from cause
+
+
+def is_out_of_memory(error: BaseException) -> bool:
+    """Return whether an error says that the memory of a device, or the main memory, is exhausted."""
+    import torch
+
+    full = isinstance(error, torch.OutOfMemoryError | MemoryError | DeviceMemoryError)
+    return full or (isinstance(error, RuntimeError) and any(said in str(error) for said in OUT_OF_MEMORY_WORDS))
 
 
 def in_hub_cache(repository: str) -> bool:

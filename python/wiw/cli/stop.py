@@ -15,6 +15,8 @@ from pathlib import Path
 from types import FrameType
 from typing import Any, NoReturn
 
+from wiw.training.launcher import count_started
+
 EXIT_RESUME = 75
 """EX_TEMPFAIL: whatever stopped the run, such as a batch system, may call `wiw resume`."""
 STOPPING = (signal.SIGTERM, signal.SIGUSR2)
@@ -31,10 +33,11 @@ def end_process(code: int) -> NoReturn:
     """End the process with an exit code, even while threads of models are still inside compiled code.
 
     Python's shutdown ends such a thread when it returns from a call, by unwinding its C++ frames; if these do not allow
-    that, the process aborts (SIGABRT) instead of returning its exit code. So once the exit handlers have run and the
-    output is flushed, the process ends without a shutdown if any other thread is alive.
+    that, the process aborts (SIGABRT) instead of returning its exit code. The same happens at times to the processes
+    that torchrun starts, whose threads of torch.distributed Python does not know. So once the exit handlers have run
+    and the output is flushed, the process ends without a shutdown if any other thread may be alive.
     """
-    if threading.active_count() == 1:
+    if threading.active_count() == 1 and count_started() == 1:
         sys.exit(code)
     atexit._run_exitfuncs()  # prints what a handler raises, and goes on
     for stream in (sys.stdout, sys.stderr):

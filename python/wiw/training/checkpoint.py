@@ -3,16 +3,51 @@
 
 from __future__ import annotations
 
-import io
 import json
 import time
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, ClassVar
+from typing import Any, BinaryIO, ClassVar
 
 from wiw.errors import ArgumentError, FileError
 from wiw.files import atomic_file
+from wiw.networks import is_out_of_memory
+
+
+class _StateFile:
+    """A file for torch to write, whose first error is raised at its end: torch would turn it into a RuntimeError."""
+
+    def __init__(self, file: BinaryIO) -> None:
+        self._file = file
+        self._error: OSError | None = None
+
+    def __enter__(self) -> _StateFile:
+        return self
+
+    def __exit__(self, kind: object, *_: object) -> None:
+        try:
+            self._file.close()
+        except OSError as error:
+            self._error = self._error or error
+        if self._error is not None and kind is None:
+            raise self._error
+
+    def write(self, data: bytes | memoryview) -> int:
+        """Write data unless an earlier write failed; return its length in any case."""
+        self._attempt(lambda: self._file.write(data))
+        return memoryview(data).nbytes
+
+    def flush(self) -> None:
+        """Hand on what is buffered."""
+        self._attempt(self._file.flush)
+
+    def _attempt(self, write: Callable[[], object]) -> None:
+        if self._error is None:
+            try:
+                write()
+            except OSError as error:
+                self._error = error
 
 
 class ResumableTrainer:
@@ -70,7 +105,7 @@ class Checkpoint:
 
         Raises:
             ArgumentError: it belongs to another training.
-            FileError: it is damaged.
+            FileError: it cannot be read, or is damaged.
         """
         import torch
 
@@ -81,6 +116,11 @@ class Checkpoint:
             identity = content["of"]
             state = TrainingState(content["epochs"], content["step"], content["state"])
         except Exception as error:  # what torch's unpickler meets in damaged bytes raises nearly anything
+            if _is_of_machine(error):
+                raise FileError(
+                    f"{self.path}: cannot be read ({error}); expected a readable file and main memory for it: mend "
+                    "this, then repeat the command to resume"
+                ) from error
             raise FileError(f"{self.path}: damaged ({error}); delete it to start again") from error
         if identity != self._identity:
             raise ArgumentError(
@@ -119,11 +159,15 @@ class Checkpoint:
         """
         import torch
 
-        packed = io.BytesIO()  # torch's own writer reports a full disk by a bare RuntimeError
-        torch.save({"of": self._identity, "epochs": epochs, "step": step, "state": state}, packed)
-        with atomic_file(self.path) as draft:
-            draft.write_bytes(packed.getbuffer())
+        content = {"of": self._identity, "epochs": epochs, "step": step, "state": state}
+        with atomic_file(self.path) as draft, _StateFile(draft.open("wb")) as file:
+            torch.save(content, file)
 
     def remove(self) -> None:
         """Delete the file at the end of training."""
         self.path.unlink(missing_ok=True)
+
+
+def _is_of_machine(error: Exception) -> bool:
+    """Return whether a file could not be read for a reason that says nothing of its content."""
+    return (isinstance(error, OSError) and error.errno is not None) or is_out_of_memory(error)

@@ -68,6 +68,7 @@ def run_training(
     if resumed is not None:
         cast(ResumableTrainer, trainer).load_state_dict(resumed.state)
         first = resumed.step
+        resumed = None  # frees its copy of the state
     for step in range(first, steps):
         loss = trainer.train_step(recipe.rate * schedule(step / steps))
         mean = loss if step == first else 0.98 * mean + 0.02 * loss

@@ -91,6 +91,23 @@ end_process({code})
 """
 
 
+LEAVING = """
+from wiw.cli.stop import end_process
+class Last:
+    def __del__(self):
+        print("shut down")
+last = Last()
+end_process(0)
+"""
+
+
+@pytest.mark.parametrize(("processes", "said"), [("1", "shut down\n"), ("2", "")])
+def test_processes_of_torchrun_end_without_a_shutdown(processes: str, said: str) -> None:
+    env = {**os.environ, "PYTHONPATH": os.pathsep.join(sys.path), "WORLD_SIZE": processes}
+    done = subprocess.run([sys.executable, "-c", LEAVING], env=env, capture_output=True, text=True, check=False)
+    assert (done.returncode, done.stdout, done.stderr) == (0, said, "")
+
+
 @pytest.mark.parametrize("daemon", [True, False])
 def test_ending_runs_exit_handlers_flushes_and_waits_for_no_thread(daemon: bool) -> None:
     done = subprocess.run(

@@ -105,6 +105,12 @@ def test_the_bins_of_the_likelihood_make_up_all_mass() -> None:
     assert float(mass.sum()) == pytest.approx(1, abs=1e-5)
 
 
+def test_the_likelihood_of_what_is_not_finite_is_not_finite() -> None:
+    """The trainer then says which batch it was."""
+    values, mean = torch.zeros(1, 2), torch.tensor([[0.0, torch.nan]])
+    assert torch.isfinite(measure_likelihood(values, mean, torch.zeros(1, 2))).tolist() == [[True, False]]
+
+
 def test_no_gradient_of_the_bound_reaches_the_noise() -> None:
     noise = torch.zeros(4, 2, 3, 3, requires_grad=True)
     shares = torch.zeros(4, 2, 3, 3, requires_grad=True)

@@ -1,11 +1,12 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Averaged weights, 8-bit Adam and the cache of latents in post-training."""
+"""Averaged weights, 8-bit Adam, memory, and the cache of latents in post-training."""
 
 from __future__ import annotations
 
 import importlib.util
 import io
 import shutil
+from dataclasses import replace
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -13,7 +14,9 @@ from typing import Any
 import numpy as np
 import pytest
 
-from wiw.errors import DependencyError
+from wiw.errors import ArgumentError, DependencyError, DeviceMemoryError
+from wiw.networks import autocast_uncached, memory_guard
+from wiw.ray_cluster import HERE, Engine
 
 pytest.importorskip("diffusers", reason="no diffusers: pip install 'wiw[diffusers]'")
 pytest.importorskip("peft", reason="no peft: pip install 'wiw[diffusers]'")
@@ -28,8 +31,8 @@ from wiw.cli import main
 from wiw.training.post_training import encode_clips
 from wiw.training.post_training.clip_order import ClipOrder
 from wiw.training.post_training.corpora import open_corpus
-from wiw.training.post_training.encode_clips import _list_rows
-from wiw.training.post_training.families import PretrainedWeights, find_family
+from wiw.training.post_training.encode_clips import ClipEncoder, _list_rows, choose_encoding_device
+from wiw.training.post_training.families import NWMFamily, PretrainedWeights, find_family
 from wiw.training.post_training.latent_cache import LatentCache
 from wiw.training.post_training.train import list_remedies, open_cache, post_train
 from wiw.training.post_training.trainer import PostTrainer
@@ -165,6 +168,60 @@ def test_numbers_of_a_recipe_file_are_kept_unless_options_replace_them(
     assert [(each.precision, each.seed) for each in found] == [(precision, seed), ("float32", 0)]
 
 
+def test_clips_are_encoded_in_the_precision_of_the_actors(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Actors of Ray may have GPUs where this machine has none."""
+    found: list[str] = []
+    monkeypatch.setattr(
+        encode_clips, "encode_clips", lambda *_, **named: (found.append(named["recipe"].precision), 1)[1]
+    )
+    monkeypatch.setattr(torch.cuda, "is_available", lambda: False)
+    (tmp_path / "data").mkdir()
+    asked = ["train", "nwm-action", "--data", str(tmp_path / "data"), "--cache", str(tmp_path / "cache")]
+    for more in ([], ["--engine", "ray"], ["--engine", "ray", "--worker-gpus", "1"]):
+        assert main([*asked, "--encode-only", *more]) == 0
+    assert found == ["float32", "float32", "bfloat16"]
+    ray = Engine(engine="ray", worker_gpus=0.5)
+    assert [choose_encoding_device(ray, each) for each in (None, "cpu")] == ["cuda", "cpu"]
+    with pytest.raises(ArgumentError, match="CUDA devices"):
+        choose_encoding_device(HERE, "cuda:99")
+
+
+def test_clips_that_need_too_much_memory_say_what_to_lower(data: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    def fill(*_: Any) -> None:
+        raise torch.OutOfMemoryError("CUDA out of memory.")
+
+    monkeypatch.setattr(NWMFamily, "load", fill)
+    with pytest.raises(
+        DeviceMemoryError, match=r"encoding clips for nwm-action on cpu .*memory\.\); a smaller size than"
+    ):
+        recipe = tiny_recipe("nwm-action", precision="bfloat16")
+        ClipEncoder("nwm-action", str(data), "cache", recipe, "all", PretrainedWeights(device="cpu"))
+
+
+def test_gradients_are_freed_after_a_step(data: Path, weights: Any) -> None:
+    trainer = make_trainer("nwm-action", data, weights("nwm-action"))
+    trainer.train_step(1e-3)
+    assert [name for name, value in trainer.trained.items() if value.grad is not None] == []
+
+
+def test_weights_in_half_precision_are_not_kept_until_the_end_of_a_pass() -> None:
+    with autocast_uncached(torch.device("cpu"), True):
+        assert torch.is_autocast_enabled("cpu") and not torch.is_autocast_cache_enabled()
+    with autocast_uncached(torch.device("cpu"), False):
+        assert not torch.is_autocast_enabled("cpu")
+
+
+def test_of_nested_guards_the_outermost_says_what_to_lower() -> None:
+    with (
+        pytest.raises(DeviceMemoryError, match=r"^training does not fit .* \(full: out of memory\); rows=1$"),
+        memory_guard("training", "rows=1"),
+        memory_guard("LTX", "offload='model'"),
+    ):
+        raise RuntimeError("full: out of memory")
+    with pytest.raises(RuntimeError, match=r"^another$"), memory_guard("training", "rows=1"):
+        raise RuntimeError("another")
+
+
 def test_the_clips_to_encode_are_those_that_a_training_takes(data: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     recipe = tiny_recipe("ltx-action", clips=7, batch=2, mirror=0.5)
     order = ClipOrder(len(open_corpus(data, "all").clips(recipe.frames)), 7, 2, recipe.seed)
@@ -252,4 +309,6 @@ def test_remedies_name_what_is_not_yet_lowered() -> None:
     said = "; ".join(list_remedies(tiny_recipe("svd-action", ema=0.9, precision="bfloat16")))
     assert "rows=1 (now 2)" in said and "optimizer=adamw8bit" in said and "ema=0" in said and "64x128" in said
     lean = tiny_recipe("svd-action", optimizer="adamw8bit", precision="bfloat16", rows=1)
+    assert "validate_every=null" in list_remedies(lean)[-1]
+    assert "validate_every" not in "".join(list_remedies(replace(lean, validate_every=None)))
     assert list_remedies(lean)[0] == "lora=32, for the Wan models" and np.isfinite(lean.rate)

@@ -18,6 +18,7 @@ from wiw.cli.train.corpus import TrackerName, describe_steps, require_data
 from wiw.cli.train.progress import TrainingProgress
 from wiw.cli.train.small_networks import Count, check_counts, check_seed, drop_none
 from wiw.errors import ArgumentError
+from wiw.networks import resolve_device
 from wiw.ray_cluster import HERE, Engine
 from wiw.training.launcher import ProcessLayout
 
@@ -164,8 +165,10 @@ def _post_train(
     """
     _require_packages(name)
     folder = require_data(name, data, ALSO_ARM)
-    chosen = _choose_recipe(name, recipe, pairs, numbers, parts)
-    if dry_run or layout != ONE_PROCESS:
+    is_launched = dry_run or layout != ONE_PROCESS
+    device = (parts.get("device") or "cuda") if is_launched else resolve_device(parts.get("device"))
+    chosen = _choose_recipe(name, recipe, pairs, numbers, device)
+    if is_launched:  # each process chooses for the machine that it runs on
         flags = {**numbers, **parts, "data": folder, "recipe": recipe, "out": out}
         options = [*flags.items(), *(("option", pair) for pair in pairs)]
         given = [part for key, value in options if value is not None for part in (f"--{key}", str(value))]
@@ -226,12 +229,13 @@ def _encode(
     Raises:
         ArgumentError: no data or no folder; see also `wiw.training.post_training.encode_clips.encode_clips`.
     """
-    from wiw.training.post_training.encode_clips import encode_clips
+    from wiw.training.post_training.encode_clips import choose_encoding_device, encode_clips
 
     folder = require_data(name, data, ALSO_ARM)
     if cache is None:
         raise ArgumentError("train: --encode-only writes encoded clips into a folder; name it with --cache")
-    chosen, began = _choose_recipe(name, recipe, pairs, numbers, parts), time.monotonic()
+    device = choose_encoding_device(place, parts.get("device"))
+    chosen, began = _choose_recipe(name, recipe, pairs, numbers, device), time.monotonic()
     with announce_resume(), Bars() as bars:
 
         def show(done: int, total: int) -> None:
@@ -262,8 +266,9 @@ def _launch(
 
 
 def _choose_recipe(
-    name: str, file: Path | None, pairs: Sequence[str], numbers: Mapping[str, Any], parts: Mapping[str, Any]
+    name: str, file: Path | None, pairs: Sequence[str], numbers: Mapping[str, Any], device: str
 ) -> PostTrainingRecipe:
+    """Return the recipe with what files and options say, in a precision for a device unless they name one."""
     from wiw.mapping_files import read_yaml_mapping
     from wiw.runs.part_options import parse_options
     from wiw.training.post_training.recipe import PostTrainingRecipe, load_recipe
@@ -272,7 +277,7 @@ def _choose_recipe(
     options = {**numbers, **parse_options(pairs, PostTrainingRecipe, "--option")}
     chosen = load_recipe(name, file, options)
     named = {*options, *(read_yaml_mapping(file, "a recipe, `name: value` lines") if file else ())}
-    return chosen if "precision" in named else choose_precision(chosen, parts.get("device"))
+    return chosen if "precision" in named else choose_precision(chosen, device)
 
 
 def _write_command(out: Path, run: Mapping[str, Any]) -> str:

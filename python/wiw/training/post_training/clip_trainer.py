@@ -126,6 +126,7 @@ class ClipTrainer(ResumableTrainer, ABC):
         for group in self.optimizer.param_groups:
             group["lr"] = learning_rate
         self.optimizer.step()
+        self.optimizer.zero_grad(set_to_none=True)  # frees their memory, for instance for validation
         self._average_weights()
         self.mean_loss = total if not self.step_count else 0.98 * self.mean_loss + 0.02 * total
         self.step_count += 1

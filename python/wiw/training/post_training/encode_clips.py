@@ -19,7 +19,7 @@ from wiw.training.post_training.clip_trainer import arrange_clips
 from wiw.training.post_training.corpora import CorpusPart, open_corpus
 from wiw.training.post_training.families import PretrainedWeights, find_family
 from wiw.training.post_training.recipe import PostTrainingRecipe, load_recipe
-from wiw.training.post_training.train import choose_precision, open_cache
+from wiw.training.post_training.train import choose_precision, list_smaller, open_cache
 from wiw.training.post_training.trainable import Encoded
 from wiw.training.post_training.trainer import encode_clip, load_clip
 from wiw.world_models import devices
@@ -65,7 +65,7 @@ def encode_clips(
     place.require_valid("encode")
     if workers < 1 or (workers > 1 and place.engine != "ray"):
         raise ArgumentError(f"encode: expected 1 worker, or several with engine ray, got {workers}")
-    device = devices.device(weights.pop("device", None))
+    device = choose_encoding_device(place, weights.pop("device", None))
     recipe = recipe or choose_precision(load_recipe(name), device)
     source = PretrainedWeights(weights.pop("weights", None), device=device, **weights)
     given: dict[str, Any] = {
@@ -89,23 +89,43 @@ def encode_clips(
     return len(rows)
 
 
+def choose_encoding_device(place: Engine, requested: str | None) -> str:
+    """Return the device that clips are encoded on: of Ray's actors, which may be on other machines, or of this process.
+
+    Raises:
+        ArgumentError: this process lacks it.
+    """
+    if place.engine == "ray":
+        return requested or ("cuda" if place.worker_gpus else "cpu")
+    return devices.device(requested)
+
+
 class ClipEncoder:
-    """The frozen networks of a training, and the cache that they fill; made once in each process."""
+    """The frozen networks of a training, and the cache that they fill; made once in each process.
+
+    Raises:
+        DeviceMemoryError: the device's memory is too small, here or in a call.
+    """
 
     def __init__(
         self, name: str, data: str, cache: str, recipe: PostTrainingRecipe, part: CorpusPart, source: PretrainedWeights
     ) -> None:
         family = find_family(name)
         corpus, recipe = family.fit(open_corpus(data, part, recipe.held_out), recipe)
-        loaded = family.load(corpus, recipe, source)
+        self._guard = partial(
+            devices.memory_guard, f"encoding clips for {name} on {source.device}", "; ".join(list_smaller(recipe))
+        )
+        with self._guard():
+            loaded = family.load(corpus, recipe, source)
         self._model, self._size = loaded.model, loaded.recipe.clip_size
         self._clips = corpus.clips(loaded.recipe.frames)
         self._cache = open_cache(Path(cache), loaded, corpus)
 
     def __call__(self, batch: Mapping[str, Any]) -> dict[str, Any]:
         """Encode the clips of a batch, "clip" int [B] and "mirrored" bool [B]; return the same."""
-        for index, mirror in zip(batch["clip"].tolist(), batch["mirrored"].tolist(), strict=True):
-            self._cache.encode(index, mirror, partial(self._encode, index, mirror), self._model.device)
+        with self._guard():
+            for index, mirror in zip(batch["clip"].tolist(), batch["mirrored"].tolist(), strict=True):
+                self._cache.encode(index, mirror, partial(self._encode, index, mirror), self._model.device)
         return {"clip": batch["clip"], "mirrored": batch["mirrored"]}
 
     def _encode(self, index: int, mirror: bool) -> tuple[Encoded, Any]:

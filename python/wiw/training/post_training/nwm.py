@@ -16,6 +16,7 @@ from torch.nn.functional import mse_loss
 
 from wiw import action
 from wiw.errors import ArgumentError
+from wiw.networks import autocast_uncached
 from wiw.training.held_out_clips import STEPS, Frames, imagine_with
 from wiw.training.held_out_front_views import FrontView, FrontViewClips, select_front_views
 from wiw.training.post_training.clips import ClipBatch
@@ -145,7 +146,7 @@ class TrainableNWM(TrainableModel):
         weights.save(folder, self.network, self.codec)
 
     def _use_precision(self) -> Any:
-        return torch.autocast(self.device.type, torch.bfloat16, enabled=self.recipe.precision == "bfloat16")
+        return autocast_uncached(self.device, self.recipe.precision == "bfloat16")
 
 
 def _check_recipe(recipe: PostTrainingRecipe, context: int) -> None:
@@ -219,7 +220,6 @@ def measure_likelihood(values: Tensor, mean: Tensor, log_deviation: Tensor) -> T
     The outermost bins of -1 to 1 reach to infinity (Ho, Jain and Abbeel 2020, equation 13).
     """
     scale, offset = (-log_deviation).exp(), values - mean
-    normal = torch.distributions.Normal(torch.zeros_like(mean), torch.ones_like(mean))
-    above, below = normal.cdf(scale * (offset + 1 / 255)), normal.cdf(scale * (offset - 1 / 255))
+    above, below = torch.special.ndtr(scale * (offset + 1 / 255)), torch.special.ndtr(scale * (offset - 1 / 255))
     mass = torch.where(values < -0.999, above, torch.where(values > 0.999, 1 - below, above - below))
     return mass.clamp(min=1e-12).log()

@@ -8,8 +8,7 @@ an action-conditioned world model is given.
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
-from collections.abc import Iterator, Mapping
-from contextlib import contextmanager
+from collections.abc import Mapping
 from typing import Any
 
 import numpy as np
@@ -18,6 +17,7 @@ from PIL import Image
 from torch import Tensor
 
 from wiw.errors import ArgumentError
+from wiw.networks import autocast_uncached
 from wiw.training.post_training.recipe import PostTrainingRecipe
 from wiw.training.post_training.trainable import Encoded
 from wiw.types import Control
@@ -55,12 +55,9 @@ class Objective(ABC):
         `random` is a generator on the CPU, so that draws are the same on all devices.
         """
 
-    @contextmanager
-    def autocast(self) -> Iterator[None]:
-        """Compute in the recipe's precision as long as the context lasts."""
-        enabled = self.recipe.precision == "bfloat16"
-        with torch.autocast(self.device.type, dtype=torch.bfloat16, enabled=enabled):
-            yield
+    def autocast(self) -> torch.autocast:
+        """Return a context in which denoisers compute in the recipe's precision."""
+        return autocast_uncached(self.device, self.recipe.precision == "bfloat16")
 
     def release_text_encoder(self) -> None:
         """Move the text encoder off the device, once the empty prompt is encoded."""

@@ -67,7 +67,7 @@ class SignalledCheckpoint(Checkpoint):
             FileError: it cannot be written.
         """
         told, due = zip(*distributed.collect((self._pending, self.is_due())), strict=True)
-        number = max(told)
+        number = max(told, key=lambda each: (each in STOPPING, each))
         if self._pending == number:
             self._pending = 0
         if number or any(due):
@@ -85,6 +85,7 @@ class SignalledCheckpoint(Checkpoint):
         distributed.call_on_main(lambda: super(SignalledCheckpoint, self).write(state, epochs, step))
 
     def _note(self, number: int, frame: FrameType | None) -> None:
-        self._pending = number
+        if self._pending not in STOPPING:
+            self._pending = number
         if number in STOPPING and distributed.count_processes() == 1:
             signal.signal(number, self._earlier[number])

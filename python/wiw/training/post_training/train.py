@@ -328,16 +328,16 @@ def open_cache(folder: Path, loaded: Loaded, corpus: Corpus) -> LatentCache:
     return LatentCache(folder, {"data": corpus.describe(), "latents": loaded.model.describe_latents(), **shape})
 
 
-def choose_precision(recipe: PostTrainingRecipe, device: str | None) -> PostTrainingRecipe:
-    """Return the recipe in float32 if there is no GPU, on which half precision is fast."""
-    return recipe if devices.device(device).startswith("cuda") else replace(recipe, precision="float32")
+def choose_precision(recipe: PostTrainingRecipe, device: str) -> PostTrainingRecipe:
+    """Return the recipe in float32 unless the device is a GPU, on which half precision is fast."""
+    return recipe if device.startswith("cuda") else replace(recipe, precision="float32")
 
 
 def list_remedies(recipe: PostTrainingRecipe) -> list[str]:
     """List the numbers of a recipe that need less memory than the present ones, the mildest first."""
-    height, width = recipe.size or (0, 0)
     remedies = [f"rows=1 (now {recipe.rows})"] if recipe.rows > 1 else []
-    remedies += ["precision=bfloat16"] if recipe.precision == "float32" else []
+    *precision, size, frames = list_smaller(recipe)
+    remedies += precision
     remedies += [] if recipe.checkpointing else ["checkpointing=true"]
     several = distributed.count_processes() > 1
     remedies += ["shard=true"] if several and not recipe.shard and recipe.optimizer == "adamw" else []
@@ -345,7 +345,15 @@ def list_remedies(recipe: PostTrainingRecipe) -> list[str]:
     remedies += ["optimizer=adamw8bit"] if eight else []
     remedies += ["ema=0"] if recipe.ema else []
     remedies += [] if recipe.lora else ["lora=32, for the Wan models"]
-    return [*remedies, f"a smaller size than {height}x{width}", f"fewer frames than {recipe.frames}"]
+    remedies += [size, frames]
+    return remedies + (["validate_every=null, if it is validation that does not fit"] if recipe.validate_every else [])
+
+
+def list_smaller(recipe: PostTrainingRecipe) -> list[str]:
+    """List the numbers of a recipe with which clips and networks are smaller than with the present ones."""
+    height, width = recipe.size or (0, 0)
+    precision = ["precision=bfloat16"] if recipe.precision == "float32" else []
+    return [*precision, f"a smaller size than {height}x{width}", f"fewer frames than {recipe.frames}"]
 
 
 def _require_free(out: Path) -> None:
