@@ -50,6 +50,7 @@ from video_model_costs import (
 
 import tiny_pipelines
 from wiw.errors import ArgumentError, DeviceMemoryError
+from wiw.networks import memory_guard
 from wiw.runs.part_options import parse_options
 from wiw.training.collect_navigation import collect_navigation
 from wiw.training.post_training.corpora import Corpus, open_corpus
@@ -57,7 +58,6 @@ from wiw.training.post_training.families import FAMILIES, PretrainedWeights, Vid
 from wiw.training.post_training.recipe import PostTrainingRecipe, load_recipe
 from wiw.training.post_training.train import choose_precision, list_remedies
 from wiw.training.post_training.trainer import PostTrainer, encode_clip
-from wiw.world_models import devices
 from wiw.world_models.video import loading
 from wiw.world_models.video.actions.model import ActionConditioned
 
@@ -234,7 +234,7 @@ def measure(
     corpus, recipe = family.fit(open_corpus(data, "all"), recipe)
     passes = min(passes, recipe.batch // recipe.rows)
     reset_peak(device)
-    with devices.memory_guard(f"training {name} on {device}", "; ".join(list_remedies(recipe))):
+    with memory_guard(f"training {name} on {device}", "; ".join(list_remedies(recipe))):
         make = partial(make_trainer, family, published, corpus, abridge(recipe, passes, steps), device)
         making, trainer = time_call(device, make)
         made = {"gigabytes_loading": read_peak(device), "seconds_making": making}

@@ -8,7 +8,7 @@ import time
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, BinaryIO, ClassVar
+from typing import Any, BinaryIO, ClassVar, cast
 
 from wiw.errors import ArgumentError, FileError
 from wiw.files import atomic_file
@@ -161,7 +161,7 @@ class Checkpoint:
 
         content = {"of": self._identity, "epochs": epochs, "step": step, "state": state}
         with atomic_file(self.path) as draft, _StateFile(draft.open("wb")) as file:
-            torch.save(content, file)
+            torch.save(content, cast(BinaryIO, file))
 
     def remove(self) -> None:
         """Delete the file at the end of training."""

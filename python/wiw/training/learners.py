@@ -10,7 +10,6 @@ from typing import TYPE_CHECKING, Any
 
 from wiw.errors import ArgumentError
 from wiw.registry import WORLD_MODELS
-from wiw.world_models import devices
 
 if TYPE_CHECKING:
     from wiw.training.place_trainer import PlaceTrainer
@@ -45,7 +44,7 @@ def make_learner(name: str) -> Learner:
     if name not in LEARNERS:
         raise ArgumentError(f"expected a model among {', '.join(LEARNERS)}, got '{name}'")
     model = WORLD_MODELS.find(name)
-    devices.require(model.requires)
+    model.requires.require()
     if name == "warpnet":
         from wiw.training.warpnet_clips import WarpNetClipRecipe, WarpNetClipTrainer
         from wiw.world_models.warpnet import weights as warpnet

@@ -30,7 +30,7 @@ from wiw.action import (
     parse_action,
     to_controls,
 )
-from wiw.errors import ArgumentError, ContractError
+from wiw.errors import ArgumentError, ContractError, DependencyError
 from wiw.registry import PLAN_SPACES, SOURCES
 from wiw.types import GRIPPER_POSES, PRIMITIVES, Conditioning, Control, ControlKind, View
 from wiw.world_models.pictures import check_pictures, sample
@@ -262,6 +262,15 @@ class Requirements:
     def missing(self) -> list[str]:
         """Packages that are not installed; nothing is imported."""
         return [name for name in self.packages if not _is_installed(name)]
+
+    def require(self) -> None:
+        """Check that the packages are installed.
+
+        Raises:
+            DependencyError: one is missing; says how to install it.
+        """
+        if missing := self.missing():
+            raise DependencyError(f"{', '.join(missing)} not installed; pip install 'wiw[{self.extra}]'")
 
 
 def _is_installed(name: str) -> bool:

@@ -10,7 +10,6 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, TypeVar
 
 from wiw.errors import ArgumentError
-from wiw.world_models import devices
 from wiw.world_models.base import Requirements, WorldModel
 
 if TYPE_CHECKING:
@@ -38,7 +37,7 @@ class Trained(WorldModel):
     _network: Any
 
     def __init__(self, weights: str | Path | None = None) -> None:
-        devices.require(self.requires)
+        self.requires.require()
         self.weights = None if weights is None else str(weights)
         self._network, self.card = self._load(weights)
 

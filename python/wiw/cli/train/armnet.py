@@ -43,10 +43,9 @@ def train_armnet(
         preparation: How training data is prepared.
     """
     from wiw.world_models.armnet.model import ArmNet
-    from wiw.world_models.devices import require
 
     check_counts(plays=plays, epochs=epochs)
-    require(ArmNet.requires)
+    ArmNet.requires.require()
     with write_weights("armnet", out):
         from wiw.training.armnet import Recipe
         from wiw.training.armnet_weights import make_weights

@@ -67,12 +67,11 @@ def train_pocket(
     from wiw.runs.part_options import parse_options
     from wiw.training.pocket.recipe import PocketRecipe
     from wiw.training.post_training.recipe import load_recipe
-    from wiw.world_models.devices import require
     from wiw.world_models.pocket.model import Pocket
 
     check_counts(epochs=epochs)
     check_seed(seed)
-    require(Pocket.requires)
+    Pocket.requires.require()
     from wiw.training.pocket import held_out
 
     with write_weights("pocket", out):

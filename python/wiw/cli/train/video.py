@@ -178,9 +178,8 @@ def _post_train(
 
 def _require_packages(name: str) -> None:
     from wiw.registry import WORLD_MODELS
-    from wiw.world_models import devices
 
-    devices.require(WORLD_MODELS.find(RUN_AS.get(name, name)).requires)
+    WORLD_MODELS.find(RUN_AS.get(name, name)).requires.require()
 
 
 def _train(name: str, data: Path, out: Path, recipe: PostTrainingRecipe, parts: Mapping[str, Any]) -> int:

@@ -64,11 +64,10 @@ def train_warpnet(
         limits: Time limit and seed.
         preparation: How training data is prepared.
     """
-    from wiw.world_models.devices import require
     from wiw.world_models.warpnet.model import WarpNet
 
     check_counts(places=places, epochs=epochs)
-    require(WarpNet.requires)
+    WarpNet.requires.require()
     watched = {"part": part, "validation": validation, "device": device}
     _check_source(data, scenes, places, limits, option, watched, preparation)
     with write_weights("warpnet", out):

@@ -14,6 +14,7 @@ from typing import Any
 import numpy as np
 
 from wiw.errors import ArgumentError
+from wiw.networks import memory_guard, resolve_device
 from wiw.ray_cluster import HERE, Engine, map_batches
 from wiw.training.post_training.clip_trainer import arrange_clips
 from wiw.training.post_training.corpora import CorpusPart, open_corpus
@@ -22,7 +23,6 @@ from wiw.training.post_training.recipe import PostTrainingRecipe, load_recipe
 from wiw.training.post_training.train import choose_precision, list_smaller, open_cache
 from wiw.training.post_training.trainable import Encoded
 from wiw.training.post_training.trainer import encode_clip, load_clip
-from wiw.world_models import devices
 
 BATCH = 16
 """Clips of a call of an actor."""
@@ -97,7 +97,7 @@ def choose_encoding_device(place: Engine, requested: str | None) -> str:
     """
     if place.engine == "ray":
         return requested or ("cuda" if place.worker_gpus else "cpu")
-    return devices.device(requested)
+    return resolve_device(requested)
 
 
 class ClipEncoder:
@@ -113,7 +113,7 @@ class ClipEncoder:
         family = find_family(name)
         corpus, recipe = family.fit(open_corpus(data, part, recipe.held_out), recipe)
         self._guard = partial(
-            devices.memory_guard, f"encoding clips for {name} on {source.device}", "; ".join(list_smaller(recipe))
+            memory_guard, f"encoding clips for {name} on {source.device}", "; ".join(list_smaller(recipe))
         )
         with self._guard():
             loaded = family.load(corpus, recipe, source)

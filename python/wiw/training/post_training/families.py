@@ -11,6 +11,7 @@ from typing import Any
 
 from wiw.action import PoseGrid
 from wiw.errors import ArgumentError
+from wiw.networks import is_path, resolve_device
 from wiw.suggestions import did_you_mean
 from wiw.training.post_training.conditioned_generator import ConditionedGenerator, build_config, identify_weights
 from wiw.training.post_training.corpora import Corpus, NavigationCorpus, require_panoramas
@@ -24,13 +25,11 @@ from wiw.training.post_training.trainable import TrainableModel
 from wiw.training.post_training.trainer import seed_weights
 from wiw.training.post_training.wan import WanObjective
 from wiw.types import GRIPPER_POSES
-from wiw.world_models import devices
 from wiw.world_models.base import Requirements
 from wiw.world_models.nwm.model import NWM
 from wiw.world_models.video.actions import variants
 from wiw.world_models.video.actions.model import PANORAMA, ActionConditioned
 from wiw.world_models.video.model import VideoModel
-from wiw.world_models.video.weights import is_path
 
 
 @dataclass(frozen=True)
@@ -123,7 +122,7 @@ class VideoFamily(Family):
 
     def load(self, corpus: Corpus, recipe: PostTrainingRecipe, source: PretrainedWeights) -> Loaded:
         """Load the generator and add encoders of the corpus's actions; see `Family.load`."""
-        devices.require(Requirements(("peft",), "diffusers"))
+        Requirements(("peft",), "diffusers").require()
         generator = load_generator(self.model, recipe, source)
         recipe = replace(recipe, frames=generator.frames, size=generator.size)
         objective = self.objective(generator, recipe)
@@ -153,13 +152,13 @@ class NWMFamily(Family):
         """Load the CDiT and its codec; see `Family.load`."""
         from wiw.world_models.nwm import weights
 
-        devices.require(NWM.requires)
+        NWM.requires.require()
         if source.variant is not None:
             raise ArgumentError(f"nwm-action: its weights have no variants, got variant={source.variant}")
         path = weights.fetch(source.resolve_folder() or NWM.weights, NWM.file, source.revision)
         network, codec = weights.load_cdit(path), weights.load_codec(weights.codec_beside(path), None)
         identity = {"digest": weights.digest(network, codec)}
-        model = TrainableNWM(network, codec, recipe, NWM.spacing, NWM.steps, devices.device(source.device))
+        model = TrainableNWM(network, codec, recipe, NWM.spacing, NWM.steps, resolve_device(source.device))
         return Loaded(model, recipe, identity)
 
 

@@ -15,6 +15,7 @@ import wiw
 from wiw.datasets.navigation import Part
 from wiw.errors import ArgumentError, FileError, TrainingError
 from wiw.files import atomic_file, atomic_folder
+from wiw.networks import memory_guard, resolve_device
 from wiw.training.held_out_clips import Imagine
 from wiw.training.post_training import distributed
 from wiw.training.post_training.clip_trainer import ClipTrainer, arrange_clips
@@ -37,7 +38,6 @@ from wiw.training.post_training.validation import (
 )
 from wiw.training.trainer import run_training, take_middles
 from wiw.types import GRIPPER_POSES, PRIMITIVES
-from wiw.world_models import devices
 from wiw.world_models.video import loading
 
 LOG = "metrics.jsonl"
@@ -105,7 +105,7 @@ def post_train(
         WeightsError, DependencyError, DeviceMemoryError: see the world model.
     """
     out = Path(out)
-    family, device = find_family(name), devices.device(device)
+    family, device = find_family(name), resolve_device(device)
     distributed.require_own_gpu(device)
     recipe = recipe or choose_precision(load_recipe(name), device)
     _require_free(out)
@@ -114,7 +114,7 @@ def post_train(
     arrange_clips(len(corpus.clips(recipe.frames)), recipe)
     held_out = find_held_out(partial(open_part, family, recipe), corpus, validation, decisions, recipe)
     source = PretrainedWeights(None if weights is None else str(weights), revision, variant, device)
-    with devices.memory_guard(f"training {name} on {device}", "; ".join(list_remedies(recipe))):
+    with memory_guard(f"training {name} on {device}", "; ".join(list_remedies(recipe))):
         loaded = family.load(corpus, recipe, source)
         recipe = loaded.recipe
         checked = None

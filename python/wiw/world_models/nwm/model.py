@@ -12,8 +12,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from wiw.errors import ArgumentError
+from wiw.networks import memory_guard, resolve_device
 from wiw.types import Conditioning, Control
-from wiw.world_models import devices
 from wiw.world_models.base import Requirements, WorldModel, accepts
 from wiw.world_models.nwm.context import context_images
 from wiw.world_models.nwm.motion import SHIFT, motions
@@ -85,13 +85,13 @@ class NWM(WorldModel):
         if self.precision not in (None, "float32", "bfloat16", "float16"):
             raise ArgumentError(f"NWM: precision is '{self.precision}', expected float32, bfloat16 or float16")
         self.accepts = replace(type(self).accepts, best_batch=self.batch)
-        devices.require(self.requires)
-        self.device = devices.device(self.device)
+        self.requires.require()
+        self.device = resolve_device(self.device)
         self.precision = self.precision or ("float32" if self.device == "cpu" else "bfloat16")
         import torch
 
         self._place = torch.device(self.device)
-        with devices.memory_guard("NWM", "its weights take about 4.5 GB; stop other programs that use the GPU"):
+        with memory_guard("NWM", "its weights take about 4.5 GB; stop other programs that use the GPU"):
             self._network, self._codec = self._load_networks()
         self.accepts = replace(self.accepts, history=self._network.size.context)
         self._side = self._network.size.latent_side * 2 ** (len(self._codec.config.block_out_channels) - 1)
@@ -139,7 +139,7 @@ class NWM(WorldModel):
         with (
             torch.inference_mode(),
             self._use_precision(),
-            devices.memory_guard(f"NWM with batch={self.batch}", "lower batch"),
+            memory_guard(f"NWM with batch={self.batch}", "lower batch"),
         ):
             motion = torch.from_numpy(steps).float().to(self._place)
             return self._roll_out(observations, motion, np.array([c.length for c in controls]), seeds)

@@ -15,8 +15,8 @@ from safetensors.torch import save_file
 from torch import Tensor
 
 from wiw.errors import ArgumentError, WeightsError
+from wiw.networks import explain_hub_error, is_path
 from wiw.world_models.nwm.cdit import Architecture, CDiT
-from wiw.world_models.video.weights import explained, is_path
 
 CODEC = "stabilityai/sd-vae-ft-ema"
 TRAINED = "cdit.safetensors"
@@ -45,7 +45,7 @@ def fetch(weights: str, file: str, revision: str | None) -> Path:
     try:
         return Path(hf_hub_download(weights, file, revision=revision))
     except Exception as error:
-        raise explained(error, weights, revision) from error
+        raise explain_hub_error(error, weights, revision) from error
 
 
 def codec_beside(checkpoint: Path) -> str:
@@ -96,7 +96,7 @@ def load_codec(vae: str, revision: str | None) -> Any:
         codec: Any = AutoencoderKL.from_pretrained(vae, revision=revision)
     except (OSError, ValueError, RuntimeError) as error:
         if not is_path(vae):
-            raise explained(error, vae, revision) from error
+            raise explain_hub_error(error, vae, revision) from error
         raise WeightsError(
             f"no AutoencoderKL in {vae} ({_first_line(error)}); `hf download {CODEC} --local-dir FOLDER` fetches one"
         ) from error

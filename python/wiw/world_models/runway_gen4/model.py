@@ -15,7 +15,6 @@ from numpy.typing import NDArray
 
 from wiw.errors import ArgumentError
 from wiw.types import Conditioning, Control
-from wiw.world_models import devices
 from wiw.world_models.base import Requirements, WorldModel, accepts
 from wiw.world_models.clips import EVEN, Alignment, frames_after_actions
 from wiw.world_models.plan_text import make_template, read_words, write_prompt
@@ -99,7 +98,7 @@ class RunwayGen4(WorldModel):
             best_batch=self.batch,
             template=self._words,
         )
-        devices.require(self.requires)
+        self.requires.require()
         self._tasks = Tasks(self.url, self.poll, self.patience, self.budget)
 
     @property

@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import Any, ClassVar, Literal, Protocol
 
 from wiw.errors import ArgumentError, WeightsError
-from wiw.world_models import devices
+from wiw.networks import memory_guard
 from wiw.world_models.base import Requirements
 
 Precision = Literal["float32", "bfloat16", "float16"]
@@ -44,7 +44,7 @@ def load_pipeline(model: Loadable, folder: Path, components: Mapping[str, Any]) 
     import torch
 
     _require_readers(folder)
-    with memory_guard(model), _hide_progress_bars():
+    with model_memory_guard(model), _hide_progress_bars():
         try:
             pipeline = getattr(diffusers, model.pipeline_class).from_pretrained(
                 folder, dtype=_choose_dtypes(model), variant=model.variant, local_files_only=True, **components
@@ -67,7 +67,7 @@ def _require_readers(folder: Path) -> None:
     """Raise DependencyError where a tokenizer is sentencepiece's model alone and what reads that is not installed."""
     models = [*folder.glob("*/spiece.model"), *folder.glob("*/tokenizer.model")]
     if any(not model.with_name("tokenizer.json").is_file() for model in models):
-        devices.require(Requirements(("sentencepiece", "google.protobuf"), "diffusers"))
+        Requirements(("sentencepiece", "google.protobuf"), "diffusers").require()
 
 
 def _require_all_parameters(pipeline: Any, folder: Path) -> None:
@@ -123,9 +123,9 @@ def _move_to_device(pipeline: Any, model: Loadable) -> None:
         pipeline.enable_sequential_cpu_offload(device=model.device)
 
 
-def memory_guard(model: Loadable) -> AbstractContextManager[None]:
+def model_memory_guard(model: Loadable) -> AbstractContextManager[None]:
     """Turn torch's error of a full GPU into one that says which options need less."""
-    return devices.memory_guard(f"{type(model).__name__} on {model.device}", "; ".join(_list_remedies(model)))
+    return memory_guard(f"{type(model).__name__} on {model.device}", "; ".join(_list_remedies(model)))
 
 
 def _list_remedies(model: Loadable) -> list[str]:

@@ -21,7 +21,6 @@ import torch
 from safetensors import SafetensorError, safe_open
 
 from wiw.errors import WeightsError
-from wiw.world_models import devices
 from wiw.world_models.base import Requirements
 
 ADAPTER = "lora"
@@ -63,7 +62,7 @@ def load_lora(file: Path, place: str, pipeline: Any) -> None:
         WeightsError: a damaged file, a layout that is not known, or layers that the denoiser does not have, all or
             some; names them.
     """
-    devices.require(Requirements(("peft",), "diffusers"))
+    Requirements(("peft",), "diffusers").require()
     tensors, metadata = _read_file(file)
     denoiser = getattr(pipeline, place)
     adapted = convert_names(tensors, place, pipeline, file)

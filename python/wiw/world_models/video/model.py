@@ -13,8 +13,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from wiw.errors import ArgumentError, ContractError
+from wiw.networks import resolve_device
 from wiw.types import Conditioning, Control
-from wiw.world_models import devices
 from wiw.world_models.base import Requirements, WorldModel, accepts
 from wiw.world_models.clips import frames_after_actions
 from wiw.world_models.video import loading
@@ -120,8 +120,8 @@ class VideoModel(WorldModel):
         self.size = (_round(self.size[0], self.multiple), _round(self.size[1], self.multiple))
         self.frames = 1 + -(-(self.frames - 1) // self.stride) * self.stride
         self.accepts = replace(type(self).accepts, size=self.size, frames=self.frames, best_batch=self.batch)
-        devices.require(self.requires)
-        self.device = devices.device(self.device)
+        self.requires.require()
+        self.device = resolve_device(self.device)
         self.precision = self.precision or ("float32" if self.device == "cpu" else self.half_precision)
         components = self.components()
         self._weights = fetch_weights(self.weights, self.pipeline_class, self.revision, self.variant, components)
@@ -193,7 +193,7 @@ class VideoModel(WorldModel):
         from PIL import Image
 
         generators = [torch.Generator("cpu").manual_seed(int(seed)) for seed in seeds]
-        with loading.memory_guard(self):
+        with loading.model_memory_guard(self):
             clips = self.generate([Image.fromarray(image) for image in images], controls, generators)
         require_no_nan(not np.isfinite(clips).all(), type(self).__name__, self.precision)
         expected = (len(images), self.frames, *self.size, 3)

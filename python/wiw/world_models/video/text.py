@@ -17,7 +17,7 @@ from wiw.types import Control, View
 from wiw.world_models.base import accepts
 from wiw.world_models.clips import EVEN, Alignment
 from wiw.world_models.plan_text import make_template, read_words, write_prompt
-from wiw.world_models.video.loading import memory_guard
+from wiw.world_models.video.loading import model_memory_guard
 from wiw.world_models.video.model import VideoModel
 
 SIZES: Mapping[str, tuple[int, int]] = {"perspective": (480, 480), "panorama": (576, 1024)}
@@ -88,6 +88,6 @@ class TextVideoModel(VideoModel):
         from wiw.world_models.video.lora import find_lora, load_lora
 
         file = find_lora(source)
-        with memory_guard(self):
+        with model_memory_guard(self):
             load_lora(file, place, self.pipeline)
         return blake2b(file.read_bytes(), digest_size=20).hexdigest()

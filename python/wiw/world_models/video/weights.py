@@ -11,19 +11,7 @@ from typing import Any
 
 from wiw.errors import ArgumentError, WeightsError
 from wiw.json_text import parse_json
-from wiw.networks import explain_hub_error as explained
-from wiw.networks import is_path
-
-__all__ = [
-    "SAMPLES",
-    "SAMPLE_BYTES",
-    "Weights",
-    "digest_folder",
-    "explained",
-    "fetch_weights",
-    "is_path",
-    "require_kind",
-]
+from wiw.networks import explain_hub_error, is_path
 
 SAMPLES, SAMPLE_BYTES = 16, 1 << 16
 """Samples of each file of weights that identify it: training changes all of a network."""
@@ -68,7 +56,7 @@ def _download(
     try:
         return Path(getattr(diffusers, pipeline).download(name, revision=revision, variant=variant, **components))
     except Exception as error:
-        raise explained(error, name, revision) from error
+        raise explain_hub_error(error, name, revision) from error
 
 
 def require_kind(folder: Path, pipelines: Sequence[str], flags: Mapping[str, bool]) -> None:

@@ -19,7 +19,6 @@ from safetensors import SafetensorError
 from safetensors.torch import load_file, save_file
 
 from wiw.errors import ArgumentError, WeightsError
-from wiw.world_models import devices
 from wiw.world_models.base import Requirements
 from wiw.world_models.video.actions.config import ActionConfig
 from wiw.world_models.video.actions.encoder import ActionEncoder
@@ -181,7 +180,7 @@ def load_lora(folder: Path, places: Sequence[str], pipeline: Any) -> None:
         DependencyError: peft is not installed.
         WeightsError: a LoRA of other layers or of another network.
     """
-    devices.require(Requirements(("peft",), "diffusers"))
+    Requirements(("peft",), "diffusers").require()
     for place in places:
         file = folder / name_lora_file(place)
         second = {"load_into_transformer_2": True} if place.endswith("_2") else {}

@@ -15,10 +15,9 @@ from numpy.typing import NDArray
 
 from wiw.errors import WeightsError
 from wiw.types import GRIPPER_POSES, Conditioning, Control
-from wiw.world_models import devices
 from wiw.world_models.base import WorldModel, accepts
 from wiw.world_models.video.actions.config import ActionConfig
-from wiw.world_models.video.loading import memory_guard
+from wiw.world_models.video.loading import model_memory_guard
 from wiw.world_models.video.model import VideoModel
 from wiw.world_models.video.weights import digest_folder
 
@@ -79,7 +78,7 @@ class ActionConditioned(WorldModel):
         if not options["weights"]:
             options["weights"] = self._config.weights
             options["revision"] = options["revision"] or self._config.revision
-        devices.require(self.requires)
+        self.requires.require()
         import diffusers
 
         from wiw.world_models.video.actions.checkpoint import has_lora
@@ -91,7 +90,7 @@ class ActionConditioned(WorldModel):
         clip = self.generator.accepts
         dimensions = {"size": clip.size, "frames": clip.frames, "best_batch": clip.best_batch}
         self.accepts = replace(type(self).accepts, **dimensions, **control)  # type: ignore[arg-type]
-        with memory_guard(self.generator):
+        with model_memory_guard(self.generator):
             self.conditioning = self._condition_denoisers()
 
     def _load_config(self) -> ActionConfig:
@@ -146,7 +145,7 @@ class ActionConditioned(WorldModel):
         frames = np.empty((len(controls), self.accepts.frames, *observations.image.shape[1:]), np.uint8)
         for rows in self.generator.batches(len(controls)):
             actions = np.stack([np.asarray(control.ids) for control in controls[rows]])
-            with memory_guard(self.generator), self.conditioning.apply(actions):
+            with model_memory_guard(self.generator), self.conditioning.apply(actions):
                 clips = self.generator.make_clips(observations.image[rows], controls[rows], seeds[rows])
             frames[rows] = np.rint(clips * 255)
         frames[:, 0] = observations.image
