@@ -73,9 +73,11 @@ def import_ray() -> Any:
 def connect_cluster(address: str | None) -> Iterator[Any]:
     """Connect to a cluster, or start one of this machine, for as long as the context lasts; yield the module.
 
+    Without an address the cluster is always a new one, also where others run here or `RAY_ADDRESS` names one.
+
     Raises:
         DependencyError: ray is not installed.
-        InfrastructureError: no cluster at the address.
+        InfrastructureError: no cluster at the address, or none could be started.
     """
     ray = import_ray()
     if ray.is_initialized():
@@ -85,14 +87,17 @@ def connect_cluster(address: str | None) -> Iterator[Any]:
     own: dict[str, Any] = {"address": address}
     if address is None:
         os.environ.setdefault("RAY_USAGE_STATS_ENABLED", "0")  # Ray would report to its makers
+        own = {"address": "local"}  # with None, Ray joins a cluster that it knows of
         own |= {"num_cpus": len(os.sched_getaffinity(0)), "object_store_memory": STORE_BYTES}  # in a SLURM job: its own
         own |= {"include_dashboard": False}
     try:
         ray.init(**own, log_to_driver=False, logging_level="error")
     except (ConnectionError, ValueError, RuntimeError, OSError) as error:
+        if address is None:
+            raise InfrastructureError(f"a Ray cluster cannot be started on this machine: {error}") from error
         raise InfrastructureError(
-            f"no Ray cluster at {address or 'this machine'}: {error}; expected the address of a cluster started with "
-            "`ray start --head`, such as auto or HOST:6379, or none for a local cluster on this machine"
+            f"no Ray cluster at {address}: {error}; expected the address of a cluster started with `ray start --head`, "
+            "such as auto or HOST:6379, or none for a local cluster on this machine"
         ) from error
     try:
         _restore(handler)

@@ -27,7 +27,7 @@ from wiw.ray_cluster import connect_cluster, import_ray
 from wiw.runs.config import EngineConfig
 from wiw.runs.limits import Limits
 from wiw.runs.ray_servers import START_SECONDS as SERVER_SECONDS
-from wiw.runs.ray_servers import LostServersError, ServerPool
+from wiw.runs.ray_servers import LostServersError, ServerPool, describe_loss
 from wiw.runs.rows import OutcomeRow
 from wiw.runs.servers import ask_servers, find_served, write_commands, write_vlm_commands
 from wiw.runs.workers import (
@@ -189,7 +189,6 @@ class _ActorPool:
         for lease in [lease for lease in self._leases if lease.rows in ready]:
             self._receive(lease)
         for lease in [lease for lease in working if lease.silence.seconds > self._patience]:
-            self._ray.kill(lease.actor)
             self._replace(lease, InfrastructureError(lease.silence.describe()))
 
     def _describe_shortage(self, serves: bool) -> str:
@@ -234,11 +233,11 @@ class _ActorPool:
         except StopIteration:
             lease.job, lease.rows = None, None
             return
-        except self._ray.exceptions.RayActorError as error:
-            self._replace(lease, error)
-            return
         except self._ray.exceptions.RayTaskError as error:
             raise InfrastructureError(f"a Ray actor failed: {error}") from error
+        except self._ray.exceptions.RayError as error:  # not only RayActorError: Ray's kill for want of memory is none
+            self._replace(lease, error)
+            return
         for row in rows:
             self._receive_row(lease, lease.job, row)
 
@@ -302,13 +301,14 @@ class _ActorPool:
         lease.rows = lease.actor.run.options(num_returns="streaming").remote(lease.job)
 
     def _replace(self, lease: _Lease, error: Exception) -> None:
-        """Lease the unfinished episodes of a lost actor again, or record them as errors.
+        """End a lost actor, and lease its unfinished episodes again, or record them as errors.
 
         Raises:
             InfrastructureError: the actor was lost before it had a job, as any other in its place would be.
         """
         self._leases.remove(lease)
-        cause = str(error).strip().splitlines()[0]
+        self._ray.kill(lease.actor)  # where only its answer was lost, it would keep its core
+        cause = describe_loss(error)
         if lease.job is None:
             raise InfrastructureError(f"a Ray actor could not start: {error}") from error
         self._jobs.extend(lease_again(lease.job, lease.unfinished, self._receiver, TRIES, cause))

@@ -161,10 +161,11 @@ class ServerPool:
         for server in [server for server in self._servers if server.ref in ready]:
             try:
                 found = self._ray.get(server.ref)
-            except self._ray.exceptions.RayActorError as error:
-                self._restart(server, str(error).strip().splitlines()[0], is_gone=True)
             except self._ray.exceptions.RayTaskError as error:
                 self._restart(server, str(error.cause))
+            except self._ray.exceptions.RayError as error:  # its actor is lost; without memory by no RayActorError
+                self._ray.kill(server.actor)
+                self._restart(server, describe_loss(error), is_gone=True)
             else:
                 if server.serves:  # it has ended, and this is why
                     self._restart(server, found)
@@ -214,6 +215,11 @@ class ServerPool:
                 f"the last server was lost {TRIES} times without any episode finishing: {command}: {cause}. Fix it, "
                 "then `wiw resume`, with --retry-errors for the episodes that were using it"
             )
+
+
+def describe_loss(error: Exception) -> str:
+    """Return in a line why Ray has lost an actor."""
+    return (str(error).strip() or type(error).__name__).splitlines()[0]
 
 
 def _find_node_address() -> str:

@@ -68,8 +68,24 @@ def test_an_actor_that_hangs_is_replaced_and_costs_no_result(ray, reference, tmp
     assert (tmp_path / "none").exists() and list_facts(tmp_path / "run") == reference
 
 
+class RayError(Exception):
+    """Ray's base class of errors; its kill for want of memory is of no other."""
+
+
+class RayActorError(RayError): ...
+
+
+class RayTaskError(RayError): ...
+
+
+EXCEPTIONS = SimpleNamespace(RayError=RayError, RayActorError=RayActorError, RayTaskError=RayTaskError)
+LOSSES = [RayActorError("lost"), RayError("killed due to the node running low on memory"), RayError()]
+
+
 class ActorInThisProcess:
     """An actor that is lost after the first row of a job of three episodes."""
+
+    loss = LOSSES[0]
 
     def __init__(self, spec, threads):
         self.jobs = []
@@ -81,12 +97,15 @@ class ActorInThisProcess:
         for index, episode in job.episodes:
             yield [OutcomeRow(job.arm, EpisodeResult(index, episode.episode_id, episode.scene, "done"))]
             if len(job.episodes) == 3:
-                yield RuntimeError("lost")
+                yield self.loss
 
 
-def test_actors_without_work_take_that_of_a_lost_one():
+@pytest.mark.parametrize("loss", LOSSES, ids=repr)
+def test_actors_without_work_take_that_of_a_lost_one(monkeypatch, loss):
+    monkeypatch.setattr(ActorInThisProcess, "loss", loss)
+
     def get(row):
-        if isinstance(row, RuntimeError):
+        if isinstance(row, RayError):
             raise row
         return row
 
@@ -94,13 +113,14 @@ def test_actors_without_work_take_that_of_a_lost_one():
         made.append(ActorInThisProcess(*given))
         return made[-1]
 
-    made, rows = [], []
+    made, rows, killed = [], [], []
     played = SimpleNamespace(
         remote=lambda **options: lambda kind: SimpleNamespace(remote=start),
         wait=lambda waiting, timeout: (waiting, []),
         get=get,
+        kill=killed.append,
         nodes=lambda: [{}],
-        exceptions=SimpleNamespace(RayActorError=RuntimeError, RayTaskError=KeyError),
+        exceptions=EXCEPTIONS,
     )
     episodes = list(enumerate(LineTask().episodes(4)))
     jobs = deque([Job("none", tuple(episodes[:1])), Job("none", tuple(episodes[1:]))])
@@ -109,6 +129,23 @@ def test_actors_without_work_take_that_of_a_lost_one():
     ray_engine._ActorPool(played, spec, jobs, receiver, 2, EngineConfig(engine="ray")).run()
     assert sorted(row.result.episode for row in rows) == [0, 1, 2, 3]
     assert [len(actor.jobs) for actor in made] == [2, 1, 1]  # the first, the lost one, and the one in its place
+    assert killed == [made[1]]  # Ray may have lost its answer alone
+
+
+def test_an_error_in_an_actor_is_no_loss_of_it():
+    """Ray's error of a task is also of the class of its cause, which may be the loss of an actor of its own."""
+
+    class BothError(RayTaskError, RayActorError): ...
+
+    def get(row):
+        raise BothError("boom")
+
+    episodes = tuple(enumerate(LineTask().episodes(2)))
+    spec = WorkerSpec(None, {}, 0, "", 4, frozenset())
+    played = SimpleNamespace(get=get, nodes=lambda: [{}], exceptions=EXCEPTIONS)
+    pool = ray_engine._ActorPool(played, spec, deque(), None, 1, EngineConfig(engine="ray"))
+    with pytest.raises(InfrastructureError, match="a Ray actor failed: boom"):
+        pool._receive(ray_engine._Lease(None, Job("none", episodes), iter([None])))
 
 
 class ActorWithoutServer(ActorInThisProcess):
@@ -165,7 +202,7 @@ def test_an_episode_that_a_lost_server_has_cost_is_leased_again(monkeypatch, kin
         wait=lambda waiting, timeout: (waiting, []),
         get=lambda row: row,
         nodes=lambda: [{}],
-        exceptions=SimpleNamespace(RayActorError=RuntimeError, RayTaskError=KeyError),
+        exceptions=EXCEPTIONS,
     )
     episodes = list(enumerate(LineTask().episodes(3)))
     receiver = SimpleNamespace(write=rows.append, discard=lambda arm, lost: None)

@@ -17,7 +17,7 @@ import pytest
 import wiw
 from wiw.cli import main
 from wiw.errors import ArgumentError, InfrastructureError, ScorerError
-from wiw.ray_cluster import HERE, Engine, map_batches, run_tasks
+from wiw.ray_cluster import HERE, Engine, connect_cluster, map_batches, run_tasks
 from wiw.runs.config import RunConfig
 from wiw.studies.evaluate import run_arms
 from wiw.training.collect_navigation import collect_navigation
@@ -29,6 +29,36 @@ SMALL: dict[str, Any] = {"rules": RULES, "size": (36, 64), "seed": 3, "backend":
 
 def contents(folder: Path) -> dict[str, bytes]:
     return {str(path.relative_to(folder)): path.read_bytes() for path in folder.rglob("*") if path.is_file()}
+
+
+# -- clusters ----------------------------------------------------------------------------------------------------------
+
+
+class PlayedRay:
+    """Stands in for ray, and takes no cluster."""
+
+    def __init__(self) -> None:
+        self.given: dict[str, Any] = {}
+
+    def is_initialized(self) -> bool:
+        return False
+
+    def init(self, **given: Any) -> None:
+        self.given = given
+        raise ConnectionError("nobody is there")
+
+
+def test_a_cluster_that_others_have_started_is_joined_only_where_it_is_named(monkeypatch) -> None:
+    """With address None, Ray joins the one of RAY_ADDRESS, or the last that was started on this machine."""
+    played = PlayedRay()
+    monkeypatch.setitem(sys.modules, "ray", played)
+    monkeypatch.setenv("RAY_ADDRESS", "10.0.0.1:6379")
+    with pytest.raises(InfrastructureError, match="cannot be started on this machine: nobody"), connect_cluster(None):
+        pass
+    assert played.given["address"] == "local" and played.given["num_cpus"] == len(os.sched_getaffinity(0))
+    with pytest.raises(InfrastructureError, match="no Ray cluster at auto: nobody"), connect_cluster("auto"):
+        pass
+    assert played.given["address"] == "auto" and "num_cpus" not in played.given
 
 
 # -- tasks -------------------------------------------------------------------------------------------------------------

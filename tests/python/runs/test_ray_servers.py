@@ -12,6 +12,7 @@ import time
 from collections.abc import Sequence
 from contextlib import suppress
 from pathlib import Path
+from types import SimpleNamespace
 
 import pytest
 import served_models
@@ -26,7 +27,7 @@ from wiw.runs import ray_servers
 from wiw.runs.config import EngineConfig
 from wiw.runs.part_options import parse_options
 from wiw.runs.recipes import AgentRecipe, TaskRecipe
-from wiw.runs.servers import _format_option, ask_servers, find_served, write_commands, write_vlm_commands
+from wiw.runs.servers import ServerCommand, _format_option, ask_servers, find_served, write_commands, write_vlm_commands
 from wiw.studies.evaluate import evaluate, resume_run
 from wiw.studies.run_log import load_run
 from wiw.world_models.remote.model import ServedModel
@@ -134,6 +135,45 @@ def test_servers_that_are_killed_come_back_and_nothing_is_lost(ray, reference, t
 def count_calls():
     file = Path(os.environ["CALLS"])
     return len(file.read_text().splitlines()) if file.exists() else 0
+
+
+class RayError(Exception):
+    """Ray's base class of errors; its kill for want of memory is of no other."""
+
+
+class RayTaskError(RayError):
+    cause = "no weights"
+
+
+@pytest.mark.parametrize(
+    ("error", "cause", "is_gone"),
+    [
+        (RayError("killed due to the node running low on memory\nmore"), "killed .* on memory", True),
+        (RayError(), "RayError", True),
+        (RayTaskError(), "no weights", False),
+    ],
+)
+def test_a_server_whose_actor_ray_kills_is_started_again_three_times(monkeypatch, error, cause, is_gone):
+    def get(ref):
+        raise error
+
+    made, killed = [], []
+    played = SimpleNamespace(
+        get=get, kill=killed.append, exceptions=SimpleNamespace(RayError=RayError, RayTaskError=RayTaskError)
+    )
+
+    def make(pool, server):
+        made.append(SimpleNamespace(start=SimpleNamespace(remote=lambda port: len(made))))
+        return made[-1]
+
+    monkeypatch.setattr(ray_servers.ServerPool, "_make_actor", make)
+    pool = ray_servers.ServerPool(played, [ServerCommand(("serve", "warp"), 1, 0)], None, "")
+    pool.start()
+    for _ in range(ray_servers.TRIES - 1):
+        pool.update_servers(pool.refs)
+    with pytest.raises(ray_servers.LostServersError, match=cause):
+        pool.update_servers(pool.refs)
+    assert len(made) == (ray_servers.TRIES if is_gone else 1) and killed == made
 
 
 def test_a_lost_actor_of_a_server_is_replaced_and_its_address_kept(ray, reference, tmp_path, monkeypatch):
