@@ -172,9 +172,10 @@ class EpisodeState:
     def record_primitive(
         self, task: NavigationSpec, action: int, position: NDArray[np.float64], at_decision: bool
     ) -> None:
-        """Record where a primitive led."""
+        """Record where a primitive led; `at_decision` where it is a segment's last, as a stop is wherever it stands."""
         self.positions.append(position)
-        self.stopped, self.at_decision = action == STOP, at_decision
+        self.stopped = action == STOP
+        self.at_decision = at_decision or self.stopped
         self.ended = self.stopped
         self.success = task.is_success(self)
         self.ended = self.ended or self.success

@@ -44,7 +44,7 @@ class ImageNavRules:
     file takes precedence, unless the radius is given as an option of the task.
     """
     checked: Literal["primitive", "decision"]
-    """Whether success is checked after every primitive or only at decisions."""
+    """Whether success is checked after every primitive or only at decisions; a stop, which ends the episode, is one."""
     distance: Literal["euclidean", "geodesic"]
     spl: Literal["metres", "actions"]
     """SPL by path length (the paper's formula) or by number of primitives."""

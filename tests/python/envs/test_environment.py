@@ -101,6 +101,14 @@ def test_official_rules_look_only_where_a_decision_is_due(two_rooms: str) -> Non
     assert env.task.rules.decisions == 21
 
 
+@pytest.mark.parametrize("plan", [[STOP], [TURN_LEFT, STOP], [TURN_LEFT, STOP, FORWARD]])
+def test_official_rules_look_where_the_agent_stops(two_rooms: str, plan: list[int]) -> None:
+    """A stop ends the episode, so that no decision follows: it counts wherever in its plan it stands."""
+    env = wiw.make("ImageNav-v0", scenes=two_rooms, preset="official")
+    start_at(env, (1.6, 0.0, 1.0), -np.pi / 2, goal=(1.6, 0.0, 1.0))
+    assert env.run(plan).terminated and env.result()["success"] == 1
+
+
 def test_official_rules_carry_out_all_but_two_of_the_chosen_plan(two_rooms: str) -> None:
     class Short(wiw.Policy):
         def propose(self, situations, candidates, horizon):
