@@ -84,14 +84,18 @@ class VlmServer:
         try:
             self._http = _Http((host, port), _Handler)
         except (OSError, OverflowError) as error:
-            raise ArgumentError(f"serve-vlm: cannot listen on port {port}: {error}; choose another --port") from None
+            raise ArgumentError(
+                f"serve-vlm: cannot listen at {host} port {port}: {error}; choose another --port (0 takes a free one), or "
+                "an address of this machine as --host"
+            ) from None
         self._host = host
         self._http.server = self
 
     @property
     def url(self) -> str:
         """Address for clients, as in "http://127.0.0.1:8000/v1"."""
-        return f"http://{self._host}:{self._http.server_address[1]}/v1"
+        host = f"[{self._host}]" if ":" in self._host else self._host
+        return f"http://{host}:{self._http.server_address[1]}/v1"
 
     @property
     def idle_seconds(self) -> float:
@@ -182,6 +186,10 @@ class _Queue:
 class _Http(ThreadingHTTPServer):
     daemon_threads = True
     server: VlmServer
+
+    def __init__(self, address: tuple[str, int], handler: type[BaseHTTPRequestHandler]) -> None:
+        self.address_family = socket.AF_INET6 if ":" in address[0] else socket.AF_INET
+        super().__init__(address, handler)
 
 
 class _Handler(BaseHTTPRequestHandler):

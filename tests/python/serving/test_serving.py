@@ -618,6 +618,14 @@ def test_a_port_that_is_taken():
             pass
 
 
+@pytest.mark.usefixtures("ipv6")
+def test_an_address_of_ipv6():
+    with serve_in_background(Plain(), host="::1") as server:
+        assert server.address.startswith("ws://[::1]:")
+        with contextlib.closing(wiw.world_model(f"remote:{server.address}")) as model:
+            assert model.accepts == Plain.accepts
+
+
 @pytest.mark.skipif(shutil.which("openssl") is None, reason="openssl makes the certificate")
 def test_certificates_that_are_none_are_named(tmp_path):
     (tmp_path / "text.pem").write_text("no certificate")

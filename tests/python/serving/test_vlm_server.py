@@ -585,9 +585,21 @@ def test_no_web_page_is_answered() -> None:
     assert len(script.calls) == 1
 
 
-def test_ports_that_are_none() -> None:
-    with pytest.raises(ArgumentError, match="choose another --port"):
+def test_ports_and_addresses_that_are_none() -> None:
+    with pytest.raises(ArgumentError, match=r"cannot listen at 127\.0\.0\.1 port 99999: .*choose another --port"):
         VlmServer(MockClient(), 99999)
+    with pytest.raises(ArgumentError, match=r"cannot listen at 192\.0\.2\.77 port 0: .*an address of this machine"):
+        VlmServer(MockClient(), host="192.0.2.77", token="secret")
+
+
+@pytest.mark.usefixtures("ipv6")
+def test_addresses_of_ipv6() -> None:
+    with VlmServer(MockClient(), host="::1") as server:
+        assert server.url.startswith("http://[::1]:")
+        assert connect(server.url).model == "mock"
+    with VlmServer(MockClient(), host="::", token="secret") as server:
+        assert server.url.startswith("http://[::]:")
+        assert connect(server.url.replace("[::]", "[::1]"), key="secret").model == "mock"
 
 
 @pytest.mark.parametrize("length", ["-5", "x", ""])
