@@ -85,8 +85,8 @@ class VlmServer:
             self._http = _Http((host, port), _Handler)
         except (OSError, OverflowError) as error:
             raise ArgumentError(
-                f"serve-vlm: cannot listen at {host} port {port}: {error}; choose another --port (0 takes a free one), or "
-                "an address of this machine as --host"
+                f"serve-vlm: cannot listen at {host} port {port}: {error}; choose another --port (0 takes a free one), "
+                "or an address of this machine as --host"
             ) from None
         self._host = host
         self._http.server = self
