@@ -21,6 +21,7 @@ from pathlib import Path
 from wiw.errors import FileError
 from wiw.files import atomic_file
 from wiw.runs.faults import explain_faults
+from wiw.runs.store_log import remove_log
 
 PERIOD = 60.0
 """Seconds between two copies."""
@@ -39,7 +40,7 @@ class ScratchCopy:
     def fetch_store(self) -> None:
         """Fetch the store from its home, unless a killed process has left more of the same run here.
 
-        The caller holds the store's lock.
+        The caller holds the locks of both, and has taken in the log at home (`take_in_log`).
 
         Raises:
             StoreError: the store at home cannot be read, or the one here cannot be written.
@@ -60,7 +61,7 @@ class ScratchCopy:
         """Copy the store home.
 
         Raises:
-            StoreError: there is no room for a second file here.
+            StoreError: there is no room for a second file here, or another program has written the one at home.
             FileError: it cannot be written at home; the store here is whole.
         """
         draft = self.path.with_name(f"{self.path.name}.copy")
@@ -68,6 +69,7 @@ class ScratchCopy:
             write_whole(connection, draft)
         with atomic_file(self.home) as file:
             shutil.copyfile(draft, file)
+            remove_log(self.home)  # else SQLite would apply it to the copy
         draft.unlink()
         self._copied = time.monotonic()
 

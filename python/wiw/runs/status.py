@@ -4,6 +4,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
+from contextlib import suppress
 from dataclasses import dataclass
 from datetime import datetime, timedelta, timezone
 from pathlib import Path
@@ -139,8 +140,10 @@ def _read_status(folder: Path) -> StoreStatus:
 
 def _read_time(path: Path) -> datetime:
     """Return when a store was last written; the latest transactions may be in the log next to it."""
-    files = [path, path.with_name(f"{path.name}-wal")]
-    return datetime.fromtimestamp(max(file.stat().st_mtime for file in files if file.exists()), timezone.utc)
+    latest = path.stat().st_mtime
+    with suppress(FileNotFoundError):  # no log, or the writer has just removed it
+        latest = max(latest, path.with_name(f"{path.name}-wal").stat().st_mtime)
+    return datetime.fromtimestamp(latest, timezone.utc)
 
 
 def _find_state(session: Mapping[str, Any] | None, done: bool) -> State:

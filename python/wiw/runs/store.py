@@ -34,7 +34,6 @@ from wiw.runs.store_file import (
     FILE_NAME,
     SCHEMA,
     connect,
-    has_log,
     is_blank,
     list_columns,
     lock_both,
@@ -43,6 +42,7 @@ from wiw.runs.store_file import (
     remove_store,
     store_path,
 )
+from wiw.runs.store_log import has_log, take_in_log
 from wiw.types import Episode
 
 SCHEMA_VERSION = 11
@@ -257,6 +257,7 @@ class RunStore:
         """Open a store for writing on a local disk."""
         lock = lock_both(copy)
         try:
+            take_in_log(copy.home)
             copy.fetch_store()
         except BaseException:
             lock.close()

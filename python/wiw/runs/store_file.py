@@ -16,6 +16,7 @@ from wiw.errors import StoreError
 from wiw.file_systems import find_network
 from wiw.runs.faults import explain_faults
 from wiw.runs.scratch import ScratchCopy
+from wiw.runs.store_log import has_log
 
 FILE_NAME = "run.sqlite"
 SCHEMA = Path(__file__).with_name("schema.sql")
@@ -113,12 +114,6 @@ def _open_uri(uri: str) -> sqlite3.Connection:
     connection = sqlite3.connect(uri, uri=True, isolation_level=None, timeout=30)
     connection.row_factory = sqlite3.Row
     return connection
-
-
-def has_log(path: Path) -> bool:
-    """Return whether transactions lie in the log beside the file."""
-    log = path.with_name(path.name + "-wal")
-    return log.exists() and log.stat().st_size > 0
 
 
 def is_blank(path: Path, writing: bool = True) -> bool:
