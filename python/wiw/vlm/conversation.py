@@ -68,7 +68,8 @@ def _ask_for_text(request: Request) -> Talk:
 
 def _read_reply(request: Request, completion: Completion) -> Reply:
     if request.schema is None:
-        return Reply(completion.text, problem=structured.find_problem(completion))
+        answer = _remove_thoughts(completion)
+        return Reply(answer.text, problem=structured.find_problem(answer))
     outcome = structured.parse_object(completion, request.schema)
     if isinstance(outcome, Problem):
         return Reply(completion.text, problem=outcome)
@@ -165,7 +166,13 @@ def _list_logprobs(completion: Completion) -> tuple[tuple[str, float], ...]:
 
 def _read_vote(completion: Completion) -> str:
     """Return the text that counts as a vote."""
-    return "" if structured.find_problem(completion) else completion.text
+    answer = _remove_thoughts(completion)
+    return "" if structured.find_problem(answer) else answer.text
+
+
+def _remove_thoughts(completion: Completion) -> Completion:
+    """Return a completion without what a model thinks aloud before its answer; unchanged where it does not."""
+    return replace(completion, text=structured.strip_thoughts(completion.text))
 
 
 def _make_reply(

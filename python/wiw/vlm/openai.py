@@ -6,6 +6,7 @@ from __future__ import annotations
 import email.utils
 import json
 import random
+import socket
 import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from concurrent.futures import FIRST_COMPLETED, CancelledError, Future, ThreadPoolExecutor, as_completed, wait
@@ -24,6 +25,7 @@ from wiw.vlm.images import ImageFormat, to_data_uri
 from wiw.vlm.messages import Call, Completion, Message
 from wiw.vlm.servers import UNKNOWN_TOKEN, Servers
 from wiw.wire.address_book import ServerAddress
+from wiw.wire.loopback import is_loopback
 
 Dialect = Literal["openai", "reasoning", "vllm", "legacy"]
 DIALECTS = ("openai", "reasoning", "vllm", "legacy")
@@ -49,6 +51,8 @@ NOBODY_THERE = (
     ": no server answers there; start one (docs/vlm.md), give another with --vlm URL, or use --vlm mock for a dry run "
     "without a model"
 )
+NO_PROXY = {"http://": None, "https://": None}
+"""Routes of the transport past the proxies that the environment names, to servers on this machine or cluster."""
 NONE_ANNOUNCED = "; start one (`wiw serve-vlm --announce`), or submit the run again"
 BROKEN = ("abort", "error", "cancelled")
 """Ends of a completion that the server broke off."""
@@ -74,7 +78,7 @@ class OpenAIClient(Client):
         timeout: seconds that one request may take; None means 120, or for announced servers, at which many may wait,
             600.
         attempts: times that it is sent in all while the server is busy or fails; how long it asks to wait is heeded.
-        patience: seconds in which it is sent again while no announced server can be reached, as weights are loaded.
+        patience: seconds for which it is sent again after announced servers have been lost, as weights are loaded.
         image_format: "png", or "jpeg" for slow connections.
         key: the server's; None means `$OPENAI_API_KEY`. Announced servers announce their own.
         options: see `Client`.
@@ -202,7 +206,9 @@ class OpenAIClient(Client):
 
         hosted = None if self._servers.are_announced else os.environ.get("OPENAI_API_KEY")
         key = server.token or hosted or "none"
-        http = openai.DefaultHttpxClient(event_hooks={"response": [self._cut_off]})
+        direct = self._servers.are_announced or is_loopback(urlsplit(server.address).hostname or "")
+        routes = {"mounts": dict(NO_PROXY)} if direct else {}
+        http = openai.DefaultHttpxClient(event_hooks={"response": [self._cut_off]}, **routes)
         sdk = openai.OpenAI(base_url=server.address, api_key=key, timeout=self.timeout, max_retries=0, http_client=http)
         if sdk.base_url.host != OPENAI_HOST:  # what the SDK reads from the environment is no business of others
             sdk.organization = sdk.project = None
@@ -266,7 +272,7 @@ class OpenAIClient(Client):
         import openai
 
         retries, stopped = retries or _Retries(), stopped or Future()
-        give_up = time.monotonic() + self.patience
+        lost: float | None = None
         while True:
             server = None
             try:
@@ -276,7 +282,8 @@ class OpenAIClient(Client):
                 failure = self._read_failure(error, retries)
             if server is not None and failure.kind in ("unreachable", "timeout"):
                 self._servers.pass_over(server)
-            may_return = failure.kind == "unreachable" and time.monotonic() < give_up
+            lost = None if failure.kind != "unreachable" else time.monotonic() if lost is None else lost
+            may_return = lost is not None and time.monotonic() < lost + self.patience
             if not failure.is_passing or (retries.count + 1 >= self.attempts and not may_return):
                 raise self._make_error(failure, retries)
             pause = retries.pause_for_server() if may_return else max(failure.pause or 0.0, retries.pause())
@@ -303,13 +310,14 @@ class OpenAIClient(Client):
         if isinstance(error, openai.APITimeoutError | TimeoutError):
             return _Failure("timeout", _shorten(error) or f"no answer within {self.timeout:g} s")
         if isinstance(error, openai.APIError):
-            return _Failure("unreachable", f"{type(error).__name__}: {_shorten(error)}")
+            cause = f" ({_shorten(error.__cause__)})" if error.__cause__ else ""
+            hint = NOBODY_THERE if _is_nobody_there(error) else ""
+            return _Failure("unreachable", f"{type(error).__name__}: {_shorten(error)}{cause}", hint=hint)
         return _Failure("protocol" if isinstance(error, _NoCompletionError) else "unreachable", _shorten(error))
 
     def _make_error(self, failure: _Failure, retries: _Retries) -> VlmError:
         times = f"{retries.count + 1} tries" if retries.count else "1 try"
-        hint = _explain_refusal(failure.said) if failure.kind == "refused" else ""
-        hint = NOBODY_THERE if failure.said.startswith("APIConnectionError") else hint
+        hint = _explain_refusal(failure.said) if failure.kind == "refused" else failure.hint
         hint = NONE_ANNOUNCED if failure.said.startswith("no server is announced") else hint
         return VlmError(f"{self.base_url}: {failure.said} ({times}){hint}", failure.kind)
 
@@ -389,6 +397,8 @@ class _Failure:
     """Seconds that the server asks to wait."""
     is_passing: bool = True
     """Whether it may succeed if it is sent again."""
+    hint: str = ""
+    """What to do about it, for the message."""
 
 
 @dataclass
@@ -463,7 +473,14 @@ def _rebuild_client(base_url: str, options: dict[str, Any]) -> OpenAIClient:
     return OpenAIClient(base_url, **options)
 
 
-def _shorten(error: Exception) -> str:
+def _is_nobody_there(error: BaseException | None) -> bool:
+    """Return whether a connection was refused, or a host is not known, rather than that something is wrong with it."""
+    while error is not None and not isinstance(error, ConnectionRefusedError | socket.gaierror):
+        error = error.__cause__ or error.__context__
+    return error is not None
+
+
+def _shorten(error: BaseException) -> str:
     return " ".join(str(error).split())[:300]
 
 

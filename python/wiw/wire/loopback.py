@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Addresses of this machine alone: listening there needs no token, and reaching them no proxy."""
+"""Addresses of this machine alone: listening there needs no token, and they are reached past any proxy."""
 
 from __future__ import annotations
 

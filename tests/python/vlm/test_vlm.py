@@ -91,6 +91,16 @@ def test_votes_are_letters_that_stand_alone(text: str, vote: int | None) -> None
     assert found is None if vote is None else found is not None and found[0].argmax() == vote and found[1].sum() == 1
 
 
+def test_thoughts_are_no_part_of_votes_and_texts() -> None:
+    thought = MockClient(lambda call: Completion("<think>A chair? No, so B.\n</think>\n\nB"))
+    reply = ask(thought, "Which?", choices=("x", "y"))
+    assert reply.by == "votes" and reply.probabilities.tolist() == [0, 1] and len(thought.calls) == 6
+    assert ask(thought, "Which?").text.strip() == "B"
+    endless = MockClient(lambda call: Completion("<think>A, or B?"))
+    assert ask(endless, "Which?", choices=("x", "y")).problem.kind == "no_option"
+    assert ask(endless, "Which?").problem.kind == "empty"
+
+
 def test_a_server_without_logprobs_is_asked_for_votes_and_the_reply_says_so() -> None:
     texts = iter(["?", "A", "(B)", "b", "no idea", "B."])
     client = MockClient(lambda call: Completion(next(texts)))

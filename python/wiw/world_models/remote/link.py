@@ -213,10 +213,11 @@ class Link:
     def _connection(self) -> connect:
         server = self._choose_server()
         self.address = server.address
+        direct = self._is_announced or is_loopback(urlsplit(server.address).hostname or "")
         return connect(
             server.address,
             additional_headers={} if server.token is None else {"Authorization": f"Bearer {server.token}"},
-            proxy=None if is_loopback(urlsplit(server.address).hostname or "") else True,
+            proxy=None if direct else True,
             compression=None,
             max_size=MOST_BYTES,
             open_timeout=HANDSHAKE,
@@ -225,8 +226,12 @@ class Link:
             close_timeout=1,
         )
 
+    @property
+    def _is_announced(self) -> bool:
+        return "://" not in self._given.address
+
     def _choose_server(self) -> ServerAddress:
-        if "://" in self._given.address:
+        if not self._is_announced:
             return self._given
         return choose_server(Path(self._given.address), self._turn)
 
