@@ -21,7 +21,7 @@ from numpy.typing import NDArray
 from wiw.errors import ArgumentError, ConstructionError, RegistryError
 from wiw.isolation.child import Host
 from wiw.isolation.failures import EndedError, ExitError, LateError, RaisedError
-from wiw.isolation.source import Isolated, Source, build_signature, describe_class, read_file_state
+from wiw.isolation.source import Isolated, Source, build_signature, describe_class, read_file_version
 from wiw.json_text import parse_json
 from wiw.registry import WORLD_MODELS
 from wiw.types import Conditioning, Control
@@ -63,12 +63,12 @@ def find_isolated_model(name: str) -> type[IsolatedModel]:
     Raises:
         RegistryError: it cannot be imported, which is tried in a separate process.
     """
-    return _make_class(name, read_file_state(name))
+    return _make_class(name, read_file_version(name))
 
 
 @lru_cache(64)
-def _make_class(name: str, state: tuple[str, int, int] | None) -> type[IsolatedModel]:
-    """Return the class of a name; an edited file has another one."""
+def _make_class(name: str, version: tuple[str, str] | None) -> type[IsolatedModel]:
+    """Return the class of a name; an edited file, or one of its own that it imports, has another one."""
     source = Source("world model", name, load_model)
     described = source.description
     attributes: dict[str, Any] = {

@@ -20,7 +20,7 @@ from numpy.typing import NDArray
 
 from wiw.errors import ContractError, RegistryError
 from wiw.isolation.child import Host
-from wiw.isolation.source import Isolated, Source, build_signature, describe_class, read_file_state
+from wiw.isolation.source import Isolated, Source, build_signature, describe_class, read_file_version
 from wiw.json_text import parse_json
 from wiw.policies.base import FrameSpec, Policy, Situation
 from wiw.registry import POLICIES
@@ -39,12 +39,12 @@ def find_isolated_policy(name: str) -> type[IsolatedPolicy]:
     """
     if not POLICIES.is_foreign(name):
         raise RegistryError(f"isolated: expected a policy of your own, as isolated:path.py:Class, got '{name}'")
-    return _make_class(name, read_file_state(name))
+    return _make_class(name, read_file_version(name))
 
 
 @lru_cache(64)
-def _make_class(name: str, state: tuple[str, int, int] | None) -> type[IsolatedPolicy]:
-    """Return the class of a name; an edited file has another one."""
+def _make_class(name: str, version: tuple[str, str] | None) -> type[IsolatedPolicy]:
+    """Return the class of a name; an edited file, or one of its own that it imports, has another one."""
     source = Source("policy", name, load_policy)
     described = source.description
     attributes: dict[str, Any] = {

@@ -60,12 +60,13 @@ class ChildProcess:
         """Segments that the child has."""
         self._process: subprocess.Popen[bytes] | None = None
         self._connection: socket.socket | None = None
+        self._owner = os.getpid()
         self._end: weakref.finalize[Any, Any] | None = None
 
     @property
     def alive(self) -> bool:
-        """Whether the process is there."""
-        return self._process is not None and not _has_ended(self._process)
+        """Whether the process is there, and is this one's: not that of the process which this one was forked from."""
+        return self._process is not None and self._owner == os.getpid() and not _has_ended(self._process)
 
     def call(
         self, function: Callable[..., Any], *arguments: Any, seconds: float = math.inf, answer: int = 0
@@ -89,7 +90,7 @@ class ChildProcess:
             RaisedError: the code raised an exception; one of wiw's own is raised as it is.
         """
         with self._lock:
-            if self._process is None:
+            if self._process is None or self._owner != os.getpid():
                 self._start()
             elif not self.alive:  # just now: another process would not have what was made in this one
                 raise EndedError(self._describe_end())
@@ -130,8 +131,8 @@ class ChildProcess:
                 process = _starter().submit(_open, command, theirs.fileno()).result()
         except OSError as error:  # out of descriptors or processes
             raise InfrastructureError(f"a model's process could not start: {error}") from error
-        self._process, self._connection = process, ours
-        self._end = weakref.finalize(self, _end, process, ours)
+        self._process, self._connection, self._owner = process, ours, os.getpid()
+        self._end = weakref.finalize(self, _end, process, ours, os.getpid())
         try:
             message = pickle.dumps((sys.path, str(Path.cwd())))
             send(ours, message)
@@ -251,6 +252,9 @@ def _starter() -> ThreadPoolExecutor:
     return ThreadPoolExecutor(1, "wiw isolation")
 
 
+os.register_at_fork(after_in_child=_starter.cache_clear)  # a forked process does not have that thread
+
+
 def _open(command: list[str], descriptor: int) -> subprocess.Popen[bytes]:
     """Start a child in its own process group, without input; its output goes to standard error."""
     return subprocess.Popen(
@@ -263,10 +267,10 @@ def _open(command: list[str], descriptor: int) -> subprocess.Popen[bytes]:
     )
 
 
-def _end(process: subprocess.Popen[bytes], connection: socket.socket) -> None:
-    """Kill a child and all of its group."""
+def _end(process: subprocess.Popen[bytes], connection: socket.socket, owner: int) -> None:
+    """Kill a child and all of its group; in a process forked from its parent, only let go of it."""
     connection.close()
-    if process.returncode is None:  # not waited for yet, so its number is nobody else's
+    if process.returncode is None and os.getpid() == owner:  # not waited for yet, so its number is nobody else's
         with suppress(ProcessLookupError, PermissionError):
             os.killpg(process.pid, signal.SIGKILL)
         with suppress(ProcessLookupError):

@@ -5,6 +5,7 @@ from __future__ import annotations
 
 import inspect
 import math
+import sys
 import weakref
 from collections import Counter
 from collections.abc import Callable, Mapping, Sequence
@@ -16,6 +17,8 @@ from wiw.errors import ConstructionError, InfrastructureError, RegistryError
 from wiw.isolation.child import Host
 from wiw.isolation.failures import EndedError, ExitError, LateError
 from wiw.isolation.process import STARTING, ChildProcess
+from wiw.registry import SOURCES
+from wiw.source_files import digest_imports
 
 _SOURCES: weakref.WeakSet[Source] = weakref.WeakSet()
 
@@ -78,8 +81,7 @@ class Source:
             InfrastructureError: it has changed since it was first imported.
         """
         found = self._import(process, seconds)
-        names = ("module", "name")  # a module's has the state of its file
-        if any(found[name] != self.description[name] for name in names):
+        if any(found[each] != self.description[each] for each in ("module", "name", "sources")):
             raise InfrastructureError(f"{self.kind} '{self.name}' has changed since it was loaded; start a new run")
 
     def _import(self, process: ChildProcess, seconds: float) -> dict[str, Any]:
@@ -164,13 +166,15 @@ class Isolated:
         self._spent = Counter({str(name): float(amount) for name, amount in spent.items()})
 
 
-def read_file_state(name: str) -> tuple[str, int, int] | None:
-    """Return an identifier of the version of the file in "path.py:Class"; None for a name without a file."""
+def read_file_version(name: str) -> tuple[str, str] | None:
+    """Return the path of the file in "path.py:Class", and a digest of it and the user's files that it imports.
+
+    None for a name without a file.
+    """
     path = Path(name.rpartition(":")[0]).expanduser()
     if path.suffix != ".py" or not path.is_file():
         return None
-    status = path.stat()
-    return str(path.resolve()), status.st_mtime_ns, status.st_size
+    return str(path.resolve()), digest_imports(path.resolve())
 
 
 def describe_class(thing: Any) -> dict[str, Any]:
@@ -180,6 +184,7 @@ def describe_class(thing: Any) -> dict[str, Any]:
     return {
         "name": str(getattr(thing, "__name__", type(thing).__name__)),
         "module": str(getattr(thing, "__module__", "")),
+        "sources": str(getattr(sys.modules.get(str(getattr(thing, "__module__", ""))), SOURCES, "")),
         "doc": inspect.getdoc(thing) or "",
         "parameters": [_describe_parameter(each) for each in parameters],
     }

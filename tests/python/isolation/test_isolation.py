@@ -16,6 +16,7 @@ import threading
 import time
 from contextlib import suppress
 from copy import deepcopy
+from multiprocessing import get_context
 from pathlib import Path
 
 import numpy as np
@@ -25,7 +26,14 @@ from locations import PYTHON_TESTS
 
 import wiw
 from wiw.action import FORWARD
-from wiw.errors import ArgumentError, ConstructionError, ContractError, RegistryError, RolloutError
+from wiw.errors import (
+    ArgumentError,
+    ConstructionError,
+    ContractError,
+    InfrastructureError,
+    RegistryError,
+    RolloutError,
+)
 from wiw.isolation import models, source
 from wiw.isolation.failures import EndedError, ExitError, LateError, RaisedError
 from wiw.isolation.models import IsolatedModel, roll_out
@@ -523,3 +531,55 @@ def test_a_small_dev_shm_is_enough(tmp_path):
 def test_a_child_names_no_other_things_than_errors(name: str) -> None:
     """What a child reports is data: only names of wiw's exceptions are followed."""
     assert type(_build_error({"type": name, "text": "no"})) is RaisedError
+
+
+SHADED = (
+    "import numpy as np, wiw\n"
+    "from {helper} import SHADE\n"
+    "class Own(wiw.WorldModel):\n"
+    "    accepts = wiw.accepts(control='image', view='perspective', size=(64, 128), frames=3)\n"
+    "    def rollout(self, observations, controls, seeds):\n"
+    "        return np.full((len(controls), 3, 64, 128, 3), SHADE, np.uint8)\n"
+)
+
+
+def save_own(folder: Path, helper: str, shade: int) -> str:
+    (folder / f"{helper}.py").write_text(f"SHADE = {shade}\n")
+    (folder / "own.py").write_text(SHADED.format(helper=helper))
+    return f"{folder / 'own.py'}:Own"
+
+
+def find_shade(made: wiw.WorldModel) -> int:
+    image = np.zeros((2, 64, 128, 3), np.uint8)
+    return int(made.rollout(Conditioning(image), CONTROLS, np.zeros(2, np.uint64)).max())
+
+
+def test_a_forked_process_makes_models_and_leaves_those_of_its_parent_alone(tmp_path) -> None:
+    """Programs that make models fork workers of their own, such as of a data loader."""
+    name = save_own(tmp_path, "forked_helper", 7)
+    made = wiw.world_model(name)
+    assert find_shade(made) == 7
+    queue = get_context("fork").SimpleQueue()
+
+    def work() -> None:
+        queue.put((find_shade(wiw.world_model(name)), find_shade(made)))
+
+    child = get_context("fork").Process(target=work)
+    child.start()
+    child.join(60)
+    if hung := child.is_alive():
+        child.kill()
+    assert not hung and not queue.empty() and queue.get() == (7, 7)
+    assert find_shade(made) == 7
+
+
+def test_an_edited_module_next_to_a_model_is_seen(tmp_path) -> None:
+    name = save_own(tmp_path, "edited_helper", 7)
+    assert models.find_isolated_model(name).__name__ == "Own"  # its process waits, and nothing has been made in it
+    save_own(tmp_path, "edited_helper", 8)
+    assert find_shade(wiw.world_model(name)) == 8
+    found = models.find_isolated_model(name)
+    save_own(tmp_path, "edited_helper", 9)
+    found.source.end_idle()
+    with pytest.raises(InfrastructureError, match="has changed since it was loaded"):
+        found.source.take_process(None)
