@@ -18,13 +18,14 @@ from collections import deque
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, field
-from multiprocessing import get_context
+from multiprocessing import active_children, get_context
 from multiprocessing.connection import Connection, wait
-from typing import Any, Protocol
+from typing import Any, NoReturn, Protocol
 
 from wiw._core import core
 from wiw.errors import Error, InfrastructureError
 from wiw.isolation.source import end_idle_processes
+from wiw.process_limits import end_with_parent
 from wiw.runs.compose import RunContext
 from wiw.runs.limits import Limits
 from wiw.runs.rows import AgentRow, DecisionRow, LostRow, OutcomeRow, RestartRow, decision_row, outcome_row
@@ -38,6 +39,8 @@ _RESEED = 0x52455345
 """Keeps the seeds of arms that repeat another apart from all other draws."""
 TRIES = 2
 """How often an episode is started if its worker dies."""
+CLOSING = 2.0
+"""Seconds that workers have to end at the end of a run, before they are killed."""
 NUMBERS = {2: "twice", 3: "three times"}
 
 
@@ -257,8 +260,9 @@ class _WorkerPool:
         for worker in self._workers:
             worker.pipe.close()
             worker.process.terminate()
+        until = time.monotonic() + CLOSING
         for worker in self._workers:
-            worker.process.join(5)
+            worker.process.join(max(0.0, until - time.monotonic()))
             if worker.process.is_alive():
                 worker.process.kill()
                 worker.process.join()
@@ -341,7 +345,7 @@ def _describe_exit(exit_code: int) -> str:
 def _start(spec: bytes, workers: int) -> _Worker:
     context = get_context("spawn")
     ours, theirs = context.Pipe()
-    process = context.Process(target=_run_worker, args=(theirs,), daemon=True)
+    process = context.Process(target=_run_worker, args=(theirs, os.getpid()))  # no daemon, so it may start processes
     with _share_threads(workers):
         process.start()
     theirs.close()
@@ -362,11 +366,14 @@ def _share_threads(workers: int) -> Iterator[None]:
             del os.environ[name]
 
 
-def _run_worker(pipe: Connection) -> None:
+def _run_worker(pipe: Connection, parent: int) -> None:
     """Run the worker's loop: it sends None to request a job; a closed pipe means that the parent has ended.
 
-    It ends without Python's shutdown, which aborts where a model's thread is still inside compiled code.
+    It ends without Python's shutdown, which aborts where a model's thread is still inside compiled code, and with all
+    processes that it has started by `multiprocessing`.
     """
+    end_with_parent(parent)
+    signal.signal(signal.SIGTERM, _end_worker)
     for number in (signal.SIGINT, signal.SIGUSR2):  # reach the whole group, or all of a job; the parent decides
         signal.signal(number, signal.SIG_IGN)
     try:
@@ -378,6 +385,12 @@ def _run_worker(pipe: Connection) -> None:
     pipe.close()
     sys.stdout.flush()
     sys.stderr.flush()
+    _end_worker()
+
+
+def _end_worker(*_: object) -> NoReturn:
+    for child in active_children():
+        child.kill()
     os._exit(0)
 
 

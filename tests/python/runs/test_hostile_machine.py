@@ -9,6 +9,7 @@ import re
 import signal
 import time
 from dataclasses import dataclass
+from multiprocessing import get_context
 from pathlib import Path
 from typing import Any
 
@@ -51,6 +52,22 @@ class Forking(LineAgent):
                 os._exit(0)
             marker.write_text(str(child))
             os.kill(os.getpid(), signal.SIGKILL)
+        return super()._decide(query)
+
+
+@dataclass
+class Starting(LineAgent):
+    """Starts processes: one that ends, and one that is left running, whose number it writes into a folder."""
+
+    children: str = ""
+
+    def _decide(self, query: Any) -> Any:
+        context = get_context("fork")
+        done, left = context.Process(target=int), context.Process(target=time.sleep, args=(120,))
+        done.start()
+        done.join()
+        left.start()
+        Path(self.children, str(left.pid)).touch()
         return super()._decide(query)
 
 
@@ -97,6 +114,27 @@ def test_a_worker_that_is_killed_and_leaves_a_child_is_replaced(tmp_path: Path) 
         assert {row["status"] for row in log.episodes} == {"done"} and len(log.episodes) == 6
     finally:
         os.kill(int((tmp_path / "child").read_text()), signal.SIGKILL)
+
+
+def test_agents_may_start_processes_in_workers_which_end_with_these(tmp_path: Path) -> None:
+    """As those of a data loader."""
+    (tmp_path / "children").mkdir()
+    agent = Starting(children=str(tmp_path / "children"))
+    log = run_arms(LineTask(), {"a": agent}, 4, out=tmp_path / "run", progress=False, workers=2, live=1)
+    assert [row["error"] for row in log.episodes] == [""] * 4
+    left = [int(each.name) for each in (tmp_path / "children").iterdir()]
+    until = time.monotonic() + 20
+    while any(is_running(each) for each in left) and time.monotonic() < until:
+        time.sleep(0.05)
+    assert len(left) >= 4 and not any(is_running(each) for each in left)
+
+
+def is_running(process: int) -> bool:
+    """Return whether a process is there, and no zombie."""
+    try:
+        return Path(f"/proc/{process}/stat").read_text().rpartition(")")[2].split()[0] != "Z"
+    except FileNotFoundError:
+        return False
 
 
 def test_an_episode_that_hangs_every_worker_is_an_error(tmp_path: Path) -> None:
