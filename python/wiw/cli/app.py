@@ -3,8 +3,10 @@
 
 from __future__ import annotations
 
+import os
 import sys
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import suppress
 from dataclasses import dataclass
 from typing import Any, NoReturn
 
@@ -273,15 +275,44 @@ def main(arguments: Sequence[str] | None = None) -> int:
     except Error as error:
         if debug:
             raise
-        print(f"wiw: {printable(error)}", *map(printable, getattr(error, "__notes__", ())), sep="\n", file=sys.stderr)
+        notes = map(printable, getattr(error, "__notes__", ()))
+        with suppress(BrokenPipeError):  # whoever read it has gone, which is no other error
+            print(f"wiw: {printable(error)}", *notes, sep="\n", file=sys.stderr, flush=True)
         return EXIT_ERROR
     except KeyboardInterrupt:
         return EXIT_INTERRUPTED
     except Terminated:
         return EXIT_RESUME
-    except BrokenPipeError:  # e.g. `wiw list | head -1`
-        sys.stderr.close()
-        return 0
+    except (BrokenPipeError, SystemExit) as error:  # e.g. `wiw list | head -1`, or Ctrl-C in `wiw run | tee log`
+        if not any(isinstance(each, BrokenPipeError) for each in _list_contexts(error)):
+            raise
+        return _find_stop_code(error)
+    finally:
+        _leave_broken_streams()
+
+
+def _find_stop_code(error: BaseException) -> int:
+    """Return the exit code of the stop or error that was being told when a pipe broke; 0 if there was none."""
+    codes = ((Terminated, EXIT_RESUME), (KeyboardInterrupt, EXIT_INTERRUPTED), (Error, EXIT_ERROR))
+    return next((code for each in _list_contexts(error) for kind, code in codes if isinstance(each, kind)), 0)
+
+
+def _list_contexts(error: BaseException | None) -> Iterator[BaseException]:
+    """Yield an error, and those in whose handling it was raised."""
+    while error is not None:
+        yield error
+        error = error.__context__
+
+
+def _leave_broken_streams() -> None:
+    """Let output go nowhere whose reader has gone: Python would complain about what is left at its shutdown."""
+    for stream in (sys.stdout, sys.stderr):
+        try:
+            stream.flush()
+        except BrokenPipeError:
+            os.dup2(os.open(os.devnull, os.O_WRONLY), stream.fileno())
+        except ValueError:  # closed
+            pass
 
 
 def _dispatch(arguments: Sequence[str]) -> Any:

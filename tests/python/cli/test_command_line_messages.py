@@ -3,19 +3,25 @@
 
 from __future__ import annotations
 
+import os
 import pickle
 import re
 import socket
+import subprocess
+import sys
 from pathlib import Path
 from types import SimpleNamespace
+from typing import Any
 
 import pytest
 from locations import PYTHON_TESTS, ROOT
 
 from wiw import errors
-from wiw.cli import main
+from wiw.cli import app, main
+from wiw.cli.app import EXIT_ERROR, EXIT_INTERRUPTED
 from wiw.cli.bars import Bars
 from wiw.cli.demo import PARTS
+from wiw.cli.stop import EXIT_RESUME, Terminated
 from wiw.errors import VlmError
 from wiw.registry import TASKS
 from wiw.vlm.openai import OpenAIClient
@@ -219,3 +225,35 @@ def test_bars_show_text_as_it_is_and_follow_a_total_that_grows(capsys: pytest.Ca
         assert (measuring.completed, measuring.total) == (4, 5)
     lines = capsys.readouterr().err.splitlines()
     assert "measuring: [red]1[/x]" in lines and lines[-1].startswith("measuring")
+
+
+def run_with_broken_pipe(arguments: list[str], stream: str) -> int:
+    """Return the exit code of a command whose output nobody reads any more."""
+    unread, written = os.pipe()
+    os.close(unread)
+    streams: dict[str, int] = {"stdout": subprocess.DEVNULL, "stderr": subprocess.DEVNULL, stream: written}
+    command = [sys.executable, "-m", "wiw.cli", *arguments]
+    try:
+        return subprocess.run(command, check=False, timeout=120, **streams).returncode
+    finally:
+        os.close(written)
+
+
+def test_a_reader_that_has_gone_changes_no_exit_code() -> None:
+    assert run_with_broken_pipe(["list", "tasks"], "stdout") == 0
+    assert run_with_broken_pipe(["run", "imagenav", "--arms", "nothing"], "stderr") == EXIT_ERROR
+
+
+@pytest.mark.parametrize(
+    ("stop", "code"), [(Terminated, EXIT_RESUME), (KeyboardInterrupt, EXIT_INTERRUPTED), (None, 0)]
+)
+def test_a_stop_that_cannot_be_told_is_one(stop: Any, code: int, monkeypatch: pytest.MonkeyPatch) -> None:
+    def fail(arguments: Any) -> None:
+        try:
+            if stop is not None:
+                raise stop
+        finally:
+            raise BrokenPipeError  # as of printing how to resume
+
+    monkeypatch.setattr(app, "_dispatch", fail)
+    assert main(["run"]) == code
