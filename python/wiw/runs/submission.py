@@ -44,6 +44,8 @@ ACTIVE = frozenset(
     )
 )
 """States of jobs that are or may be waiting or running: `sacct` does not know a new job for some seconds."""
+ENDED = ("Invalid job id specified", "already completing or completed")
+"""What `scancel` says of jobs that have ended."""
 INVALID = 1
 """Exit code of a command that has ended with an invalid run, but also of one that has crashed."""
 
@@ -265,7 +267,7 @@ def find_active(run: str | Path) -> list[SubmittedJob]:
 
 
 def cancel(run: str | Path) -> list[SubmittedJob]:
-    """Cancel all unfinished jobs of a run and return them; everything recorded is kept.
+    """Cancel all jobs of a run that are waiting or running and return them; everything recorded is kept.
 
     Raises:
         StoreError: no jobs were submitted for it, or the list of them is damaged.
@@ -275,17 +277,16 @@ def cancel(run: str | Path) -> list[SubmittedJob]:
     jobs = read_jobs(folder)
     if not jobs:
         raise StoreError(f"no jobs of {run}: expected a folder of `wiw submit` with {FILE_NAME} in it")
-    told = [job for job in jobs if job.cluster == "local" and _end_controller(job.id)]
-    arrays = list(dict.fromkeys(job.id.partition("_")[0] for job in jobs if job.cluster == "slurm"))
-    if arrays:
-        try:
-            subprocess.run(["scancel", *arrays], check=True, capture_output=True, text=True)
-        except (OSError, subprocess.CalledProcessError) as error:
-            raise InfrastructureError(
-                f"scancel {' '.join(arrays)}: {getattr(error, 'stderr', '') or error}; expected a machine of the "
-                "cluster from which the jobs were submitted"
-            ) from error
-    return told + [job for job in jobs if job.cluster == "slurm"]
+    active = find_active(folder)
+    told = [job for job in active if job.cluster == "local" and _end_controller(job.id)]
+    arrays = dict.fromkeys(_name_array(job) for job in active if job.cluster == "slurm")
+    said = {array: _cancel_array(array) for array in arrays}
+    if failed := {array: text for array, text in said.items() if text and not _has_ended(text)}:
+        raise InfrastructureError(
+            f"scancel {' '.join(failed)}: {'; '.join(failed.values())}; expected a machine of the cluster from which "
+            "the jobs were submitted"
+        )
+    return told + [job for job in active if job.cluster == "slurm" and not said[_name_array(job)]]
 
 
 def _parse(path: Path) -> list[Mapping[str, Any]]:
@@ -313,6 +314,24 @@ def _find_state(folder: Path, job: SubmittedJob) -> str:
         return str(_import_submitit().SlurmJob(folder / LOGS, job.id).state)
     except (DependencyError, OSError) as error:
         return f"UNKNOWN ({error})"
+
+
+def _name_array(job: SubmittedJob) -> str:
+    return job.id.partition("_")[0]
+
+
+def _cancel_array(array: str) -> str:
+    """Cancel what is left of an array of SLURM jobs; return why that is impossible, if so."""
+    try:
+        done = subprocess.run(["scancel", array], check=False, capture_output=True, text=True)
+    except OSError as error:
+        return str(error)
+    return "" if done.returncode == 0 else done.stderr.strip() or f"exit code {done.returncode}"
+
+
+def _has_ended(text: str) -> bool:
+    """Return whether scancel says that all jobs of an array have ended; SLURM forgets them after some minutes."""
+    return any(each in text for each in ENDED)
 
 
 def _end_controller(process: str) -> bool:

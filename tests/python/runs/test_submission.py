@@ -405,8 +405,51 @@ def test_an_array_of_slurm_jobs(tmp_path, slurm, capsys):
     wait_for(lambda: wiw.status(out).ended == 8)
     assert (slurm / "requeued").read_text() == "70_0\n", logs(out)
     assert wiw.merge([out], out).complete and wiw.verify(out).same
-    assert main(["cancel", str(out)]) == 0 and (slurm / "cancelled").read_text() == "70"
+    assert main(["cancel", str(out)]) == 0 and not (slurm / "cancelled").exists()  # none is left
     assert "job 70_0" in json.dumps(main(["status", str(out)]) or capsys.readouterr().out)
+
+
+STATES = "JobID|State|NodeList\n100_0|FAILED|n\n100_1|COMPLETED|n\n300_0|RUNNING|n\n300_1|COMPLETED|n\n"
+"""What `sacct` says; not what became of 200_0."""
+
+
+@pytest.mark.parametrize(
+    ("answer", "canceled"),
+    [
+        ("", ["200_0", "300_0"]),
+        ("scancel: error: Kill job error on job id 200: Invalid job id specified", ["300_0"]),
+        ("scancel: error: Kill job error on job id 200: Job/step already completing or completed", ["300_0"]),
+    ],
+)
+def test_jobs_that_slurm_has_forgotten_keep_no_other_from_being_cancelled(tmp_path, slurm, answer, canceled):
+    """SLURM refuses ids that it knows no more, and cancels the others given with them."""
+    (slurm / "sacct").write_text(f"#!/bin/sh\ncat << EOF\n{STATES}EOF\n")
+    refused = f"if '{answer}' and '200' in sys.argv:\n    sys.exit('{answer}')\n"
+    (slurm / "scancel").write_text(
+        f"#!{sys.executable}\nimport os, sys\n{refused}"
+        "open(os.environ['FAKE_SLURM'] + '/cancelled', 'a').write(f'{sys.argv[1:]}')\n"
+    )
+    submitit.SlurmJob.watcher.clear()
+    jobs = [
+        {"cluster": "slurm", "id": name, "arguments": ["run"]} for name in ("100_0", "100_1", "200_0", "300_0", "300_1")
+    ]
+    (tmp_path / "jobs.json").write_text(json.dumps(jobs))
+    assert [job.id for job in cancel(tmp_path)] == canceled
+    assert (slurm / "cancelled").read_text() == ("" if answer else "['200']") + "['300']"
+    submitit.SlurmJob.watcher.clear()
+
+
+def test_a_cluster_that_cannot_be_told_to_cancel_is_said_once_the_others_are_told(tmp_path, slurm):
+    (slurm / "sacct").write_text("#!/bin/sh\necho 'JobID|State|NodeList'\n")
+    say = "[ $1 = 100 ] && echo no munge >&2; exit 1"
+    (slurm / "scancel").write_text(f'#!/bin/sh\necho "$1" >> $FAKE_SLURM/told; {say}')
+    submitit.SlurmJob.watcher.clear()
+    jobs = [{"cluster": "slurm", "id": name, "arguments": ["run"]} for name in ("100_0", "200_0")]
+    (tmp_path / "jobs.json").write_text(json.dumps(jobs))
+    with pytest.raises(InfrastructureError, match=r"scancel 100 200: no munge; exit code 1; expected a machine"):
+        cancel(tmp_path)
+    assert (slurm / "told").read_text() == "100\n200\n"
+    submitit.SlurmJob.watcher.clear()
 
 
 def test_shards_of_which_slurm_says_nothing_are_not_submitted_twice(tmp_path, slurm):
