@@ -5,10 +5,10 @@ from __future__ import annotations
 
 import math
 import shlex
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import TYPE_CHECKING, Annotated, Any
 
 from tyro.conf import Positional, arg
 
@@ -30,6 +30,8 @@ SERVERS, VLM_SERVERS = "servers", "vlm-servers"
 """Subfolders of the run's folder in which servers of the world model and the language model announce themselves."""
 IDLE = "1800"
 """Seconds without a client after which a server exits."""
+SECRETS = {"key": "OPENAI_API_KEY", "token": "WIW_TOKEN"}
+"""Options that are secrets of servers, which no store keeps, and the environment variables read in their place."""
 
 
 def submit(
@@ -91,6 +93,7 @@ def submit(
             "submit: --server-partition is for the jobs of --servers and --vlm-servers: give their number with it"
         )
     prepared = prepare_run(task, parts, arms, rules, search, replace(config, salt=_find_salt(config)))
+    _require_no_secrets(prepared)
     folder, count = Path(prepared.settings.out or ""), prepared.count
     Shard(1, shards).select(count)
     serving = _write_servers(folder, prepared, parts.world_model, jobs.cluster)
@@ -149,6 +152,31 @@ def _find_salt(config: RunConfig) -> str:
     before = [job.arguments for job in read_jobs(Path(config.out))] if config.out is not None else []
     found = [own[own.index("--salt") + 1] for own in before if "--salt" in own]
     return found[0] if found else keys.draw_salt()
+
+
+def _require_no_secrets(prepared: PreparedRun) -> None:
+    """Check that no option is a secret: commands of jobs are printed, and kept in files that others can read.
+
+    Raises:
+        ArgumentError: one is.
+    """
+    agents = [prepared.agent, *prepared.recipes.values()]
+    found = [name for options in [prepared.task.options, *map(vars, agents)] for name in _find_secrets(options)]
+    if found:
+        raise ArgumentError(
+            f"submit: the option {found[0]}= is a secret, but the command of a job is kept in the run's folder, where "
+            f"others can read it: leave it out and set {SECRETS[found[0]]}, which jobs inherit, or name a folder of "
+            "announced servers (remote:FOLDER), whose files only you can read"
+        )
+
+
+def _find_secrets(options: Mapping[str, Any]) -> Iterator[str]:
+    """Return the names of secrets among options, also in mappings inside, such as roles of policy vlm."""
+    for name, value in options.items():
+        if isinstance(value, Mapping):
+            yield from _find_secrets(value)
+        elif name in SECRETS and value is not None:
+            yield name
 
 
 def _write_command(

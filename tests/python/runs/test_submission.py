@@ -20,9 +20,11 @@ import wiw
 from wiw.cli import main
 from wiw.cli.command_line import format_flags
 from wiw.cli.parts import AgentFlags, TaskFlags
+from wiw.cli.submit import SECRETS
 from wiw.errors import ArgumentError, DependencyError, InfrastructureError, StoreError
 from wiw.loop.config import AgentConfig
 from wiw.runs.config import RunConfig
+from wiw.runs.store import _hide_secret
 from wiw.runs.submission import (
     LOGS,
     ClusterConfig,
@@ -316,6 +318,36 @@ def test_every_arm_of_the_served_model_asks_the_servers(tmp_path, capsys):
         f"warp={served}",
     ]
     assert run[run.index("--world-model") + 1] == served and "--world-model-option" not in run
+
+
+ROLES = '{"proposal": {"model": "small", "key": "sk-1"}}'
+
+
+@pytest.mark.parametrize(
+    ("variable", "arguments"),
+    [
+        ("OPENAI_API_KEY", ["--policy", "vlm", "--policy-option", "key=sk-1"]),
+        ("OPENAI_API_KEY", ["--revision", "vlm", "--revision-option", "key=sk-1"]),
+        ("OPENAI_API_KEY", ["--policy", "vlm", "--vlm-model", "big", "--policy-option", f"roles={ROLES}"]),
+        ("WIW_TOKEN", ["--world-model", "remote:ws://h:1", "--world-model-option", "token=sk-1"]),
+        ("WIW_TOKEN", ["--world-model", "remote:ws://h:1", "--world-model-option", "token=sk-1", "--arms", "none"]),
+        ("WIW_TOKEN", ["--arms", "none,far=remote:ws://h:1?token=sk-1"]),
+    ],
+)
+def test_secrets_are_neither_printed_nor_written(tmp_path, capsys, variable, arguments):
+    with pytest.raises(ArgumentError, match=f"is a secret, .* leave it out and set {variable}") as error:
+        main(["submit", "imagenav", "--dry-run", "--out", str(tmp_path / "run"), *arguments, "--debug"])
+    shown = capsys.readouterr()
+    assert "sk-1" not in f"{error.value}{shown.out}{shown.err}" and not (tmp_path / "run").exists()
+
+
+def test_what_submit_refuses_as_a_secret_stores_hide():
+    assert [_hide_secret(f"{name}=sk-1") for name in SECRETS] == [f"{name}=***" for name in SECRETS]
+
+
+def test_an_arm_may_be_named_like_a_secret(tmp_path, capsys):
+    arms = ["--arms", "token=copy,key=none", "--policy", "heuristic", "--revision", "matcher"]
+    assert main(["submit", "imagenav", "--dry-run", "--shards", "1", "--out", str(tmp_path), *arms]) == 0
 
 
 def test_a_partition_of_no_servers_is_refused(tmp_path):
