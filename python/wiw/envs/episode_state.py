@@ -59,12 +59,16 @@ class NavigationSpec(ABC):
     @property
     @abstractmethod
     def episode_count(self) -> int | None:
-        """How many episodes there are; None if there is no end of them."""
+        """How many episodes there are; None if there is no end of them, or if it takes too long to know."""
 
     @property
     def drawn_count(self) -> int:
         """Among how many episodes, the first ones, a seed of gymnasium's `reset` draws."""
         return self.episode_count or 64
+
+    def wrap_index(self, index: int) -> int:
+        """Return an episode's number modulo the number of episodes."""
+        return index % self.episode_count if self.episode_count else index
 
     @property
     def pointing(self) -> Pointing | None:
@@ -230,7 +234,7 @@ def wrap_episode(task: NavigationSpec, index: int) -> int:
     """
     if index < 0:
         raise ArgumentError(f"expected an episode number of at least 0, got {index}")
-    return index % task.episode_count if task.episode_count else index
+    return task.wrap_index(index)
 
 
 def start_episode(task: NavigationSpec, episode: Episode) -> tuple[Any, EpisodeState, Goal]:

@@ -5,6 +5,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
+from functools import cached_property
 from pathlib import Path
 from typing import Any, Literal
 
@@ -13,9 +14,9 @@ from numpy.typing import NDArray
 
 from wiw.datasets.episodes import read_json
 from wiw.datasets.questions import Question, openeqa
-from wiw.datasets.questions.balance import make_episodes
+from wiw.datasets.questions.balance import EpisodeSeries
 from wiw.datasets.questions.blind import blind_answer
-from wiw.datasets.questions.generate import EpisodeRules, generate
+from wiw.datasets.questions.generate import EpisodeRules, generate, generate_available
 from wiw.datasets.questions.mesh_table import NO_ATTRIBUTES, read_attributes
 from wiw.datasets.visibility import COARSE, measure_sizes
 from wiw.datasets.worlds import World, world
@@ -29,6 +30,8 @@ from wiw.tasks.navigation import NavigationTask
 from wiw.typed_values import require_positive
 from wiw.types import Episode, Goal, TableSpec, TextAnswer, Wording
 
+COUNTED_SCENES = 16
+"""Apartments whose episodes are all made to be counted, which takes some seconds each."""
 HALF_TURN = 8
 """Maximum number of primitives of a turn: 22.5 degrees each, the shorter way round."""
 SEEN = 0.008
@@ -201,13 +204,64 @@ class AEQA(NavigationTask):
         Of generated apartments each is asked in two at least, with different answers. A scene from a file is used
         alone: its questions are unbalanced, and their episodes say so (`info["unbalanced"]`).
         """
+        if self.is_balanced:
+            return [_describe(episode) for episode in self._series.require(count)]
+        place = world(resolve(self.scenes)[0], self.backend)
+        alone = generate(place, count, self.seed, self.generator, attributes=self.attributes)
+        return [_describe(replace(each, info={**each.info, "unbalanced": True})) for each in alone]
+
+    @cached_property
+    def _series(self) -> EpisodeSeries:
+        """The episodes of apartments."""
         scenes = resolve(self.scenes)
-        if not self.is_balanced:
-            place = world(scenes[0], self.backend)
-            alone = generate(place, count, self.seed, self.generator, attributes=self.attributes)
-            return [_describe(replace(each, info={**each.info, "unbalanced": True})) for each in alone]
-        made = make_episodes(scenes, count, self.seed, self.generator, per_scene=self.per_scene, backend=self.backend)
-        return [_describe(episode) for episode in made]
+        return EpisodeSeries(scenes, self.seed, self.generator, per_scene=self.per_scene, backend=self.backend)
+
+    @property
+    def episode_count(self) -> int | None:
+        """How many episodes there are: as many as questions are found in a few scenes, which takes seconds for each;
+        None for many apartments.
+        """
+        if not self._makes_questions:
+            return super().episode_count
+        return self._count_up_to(None) if len(resolve(self.scenes)) <= COUNTED_SCENES else None
+
+    @property
+    def drawn_count(self) -> int:
+        """Among how many episodes a seed draws: those of a usual run, or as many as there are.
+
+        Raises:
+            ArgumentError: the scenes give none.
+        """
+        if not self._makes_questions:
+            return super().drawn_count
+        self.episodes(1)
+        return self._count_up_to(self.default_episodes)
+
+    def wrap_index(self, index: int) -> int:
+        """Return an episode's number modulo the number of episodes, of which no more are made than that one needs.
+
+        Raises:
+            ArgumentError: the scenes give none.
+        """
+        if not self._makes_questions:
+            return super().wrap_index(index)
+        if index < len(self._episodes):
+            return index
+        self.episodes(1)
+        return index % self._count_up_to(index + 1)
+
+    @property
+    def _makes_questions(self) -> bool:
+        """Whether episodes are made as here, not read, nor made in another way by a class derived from this one."""
+        names = ("episodes", "generate_first")
+        return not self.episode_file and all(getattr(type(self), name) is getattr(AEQA, name) for name in names)
+
+    def _count_up_to(self, most: int | None) -> int:
+        """Return the number of episodes, or `most` if there are more."""
+        if self.is_balanced:
+            return len(self._series.take(most))
+        place = world(resolve(self.scenes)[0], self.backend)
+        return len(generate_available(place, most, self.seed, self.generator, attributes=self.attributes))
 
     def make_goal(self, place: World, episode: Episode) -> Goal:
         """Return the question's text, nothing else of it, and the budget."""

@@ -16,8 +16,11 @@ from run_facts import list_facts
 import wiw
 from wiw.action import FORWARD, STOP, TURN_LEFT
 from wiw.datasets.episodes import save
-from wiw.datasets.questions import Question
+from wiw.datasets.questions import Question, balance
+from wiw.datasets.questions.answers import Fact
+from wiw.datasets.questions.generate import Answerable
 from wiw.datasets.worlds import world
+from wiw.envs.episode_state import wrap_episode
 from wiw.errors import ArgumentError, ContractError, FileError, JudgeError
 from wiw.judging import Judge, Judgement
 from wiw.loop.scheduler import run_episodes
@@ -425,6 +428,80 @@ def test_one_and_two_workers_find_out_the_same(episode, tmp_path):
         wiw.evaluate(task, agent, 2, out=out, workers=workers, keep_images="all", progress=False).close()
     assert list_facts(tmp_path / "1") == list_facts(tmp_path / "2")
     assert len(load_run(tmp_path / "1").episodes) == 2
+
+
+@pytest.fixture
+def blocks(monkeypatch: pytest.MonkeyPatch) -> list[str]:
+    """Give every block of several apartments two pairs of questions, one alone none; return the blocks begun."""
+    begun: list[str] = []
+
+    def pair_questions(block, *_):
+        begun.append(block[0])
+        yield from [(make_answerable(block[0]), make_answerable(block[1]))] * 2 if len(block) > 1 else []
+
+    monkeypatch.setattr(balance, "_count_rooms", lambda scene: 6)
+    monkeypatch.setattr(balance, "pair_questions", pair_questions)
+    return begun
+
+
+def make_answerable(scene: str) -> Answerable:
+    fact = Fact("blue", (), ())
+    at = (0.0, 0.0, 0.0)
+    return Answerable(scene, QUESTION.text, "color", QUESTION.slots, fact, 0, at, 0.0, 2.0, ((*at, 0.0),))
+
+
+def test_there_are_as_many_episodes_as_questions_in_pairs(blocks):
+    """Nine apartments have a share of 45, and the last of them nobody to be paired with."""
+    task = AEQA("apartments:val:9")
+    assert [wrap_episode(task, index) for index in (0, 7, 8, 9, 44)] == [0, 7, 0, 1, 4]
+    assert task.episode_count == len(task.episodes(8)) == 8 and task.drawn_count == 8
+    with pytest.raises(ArgumentError, match="only 8 of 9 questions in 3 blocks"):
+        task.episodes(9)
+
+
+def test_a_single_apartment_is_refused_where_it_gives_no_questions(blocks):
+    task = AEQA("apartments:val:1")
+    assert task.episode_count == 0
+    for use in (lambda: task.drawn_count, lambda: wrap_episode(task, 0), lambda: task.episode(0)):
+        with pytest.raises(ArgumentError, match=r"name more scenes .*, or set twins=1"):
+            use()
+
+
+def test_each_block_of_apartments_is_asked_once(blocks):
+    task = AEQA("apartments:val")
+    made = [task.episode(wrap_episode(task, index)) for index in (*range(12), 3, 11)]
+    assert blocks == ["apartments:val/0", "apartments:val/4", "apartments:val/8"]
+    assert task.episode_count is None and [each.episode_id for each in made[:12]] == [f"{i:04d}" for i in range(12)]
+    sent = pickle.loads(pickle.dumps(task))
+    assert sent.episodes(12) == made[:12] and len(blocks) == 3
+    assert sent.episodes(14) == task.episodes(14)
+
+
+def test_an_interrupted_series_goes_on(blocks, monkeypatch):
+    series = balance.EpisodeSeries(wiw.scenes.resolve("apartments:val:8"), 0)
+    whole, pair_questions = balance.EpisodeSeries(series.scenes, 0).take(), balance.pair_questions
+
+    def interrupt(block, *rest):
+        if block[0] == "apartments:val/4":
+            raise KeyboardInterrupt
+        return pair_questions(block, *rest)
+
+    monkeypatch.setattr(balance, "pair_questions", interrupt)
+    with pytest.raises(KeyboardInterrupt):
+        series.take(6)
+    monkeypatch.setattr(balance, "pair_questions", pair_questions)
+    assert series.take() == whole and len(whole) == 8
+
+
+def test_a_scene_alone_has_as_many_episodes_as_questions(monkeypatch, tmp_path):
+    """Those of a house from a file come to an end, too."""
+    monkeypatch.setattr("wiw.tasks.aeqa.resolve", lambda spec: [SCENE])
+    monkeypatch.setattr(AEQA, "is_balanced", False)
+    found = tuple(replace(make_answerable(SCENE), text=text) for text in ("one?", "two?", "three?"))
+    monkeypatch.setattr("wiw.datasets.questions.generate.questions_of", lambda *_: found)
+    task = AEQA(SCENE)
+    assert task.episode_count == 3 and task.drawn_count == 3
+    assert [wrap_episode(task, index) for index in (2, 3, 7)] == [2, 0, 1]
 
 
 def test_presets_differ_in_what_the_published_code_does():

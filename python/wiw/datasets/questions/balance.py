@@ -13,7 +13,8 @@ from __future__ import annotations
 from collections import Counter
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
-from itertools import combinations
+from itertools import combinations, islice
+from typing import Any
 
 import numpy as np
 
@@ -57,19 +58,76 @@ def make_episodes(
     Raises:
         ArgumentError: the scenes have too few questions, or too few rooms; says how many.
     """
-    made: list[Episode] = []
-    blocks = 0
-    for block in compose_blocks(scenes, rules):
-        blocks += 1
-        for pair in pair_questions(block, seed, rules, per_scene, backend):
-            made += to_episodes(pair, len(made))
-            if len(made) >= count:
-                return made[:count]
-    raise ArgumentError(
-        f"only {len(made)} of {count} questions in {blocks} blocks of up to {BLOCK} scenes with {rules.rooms} rooms or "
-        "more, each asked in two of them with different answers; name more scenes (apartments:SPLIT:N), raise "
-        "per_scene, or lower rooms"
-    )
+    return EpisodeSeries(scenes, seed, rules, per_scene=per_scene, backend=backend).require(count)
+
+
+class EpisodeSeries:
+    """The episodes of scenes that are named by single specs, made in order, each once, as far as they are needed.
+
+    It can be pickled: in another process the episodes made so far are there, and further ones take as long as all.
+    """
+
+    def __init__(
+        self,
+        scenes: Sequence[str],
+        seed: int,
+        rules: EpisodeRules = DEFAULT_RULES,
+        *,
+        per_scene: int = 8,
+        backend: Backend = "auto",
+    ) -> None:
+        self.scenes, self.seed, self.rules, self.per_scene, self.backend = scenes, seed, rules, per_scene, backend
+        self._made: list[Episode] = []
+        self._rest: Iterator[Episode] | None = None
+        self._is_complete = False
+
+    def take(self, count: int | None = None) -> list[Episode]:
+        """Return the first `count` episodes, or as many as there are; None for all."""
+        if not self._is_complete and (count is None or len(self._made) < count):
+            self._extend(count)
+        return self._made[:count]
+
+    def require(self, count: int) -> list[Episode]:
+        """Return the first `count` episodes.
+
+        Raises:
+            ArgumentError: the scenes have too few questions, or too few rooms; says how many.
+        """
+        found = self.take(count)
+        if len(found) < count:
+            raise ArgumentError(self._explain_lack(count))
+        return found
+
+    def _extend(self, count: int | None) -> None:
+        if self._rest is None:
+            self._rest = islice(self._generate(), len(self._made), None)
+        try:
+            self._made += islice(self._rest, None if count is None else count - len(self._made))
+        except BaseException:  # such as Ctrl-C in a notebook: a broken generator would look like an exhausted one
+            self._rest = None
+            raise
+        self._is_complete = count is None or len(self._made) < count
+
+    def _generate(self) -> Iterator[Episode]:
+        first = 0
+        for block in compose_blocks(self.scenes, self.rules):
+            for pair in pair_questions(block, self.seed, self.rules, self.per_scene, self.backend):
+                yield from to_episodes(pair, first)
+                first += 2
+
+    def _explain_lack(self, count: int) -> str:
+        blocks = sum(1 for _ in compose_blocks(self.scenes, self.rules))
+        more = "raise per_scene, or lower rooms"
+        if len(self.scenes) == 1:
+            more = "or set twins=1 for questions about this one and edited copies of it"
+        return (
+            f"only {len(self._made)} of {count} questions in {blocks} blocks of up to {BLOCK} scenes with "
+            f"{self.rules.rooms} rooms or more, each asked in two of them with different answers; name more scenes "
+            f"(apartments:SPLIT:N), {more}"
+        )
+
+    def __getstate__(self) -> dict[str, Any]:
+        return {**self.__dict__, "_rest": None}
 
 
 def compose_blocks(scenes: Sequence[str], rules: EpisodeRules) -> Iterator[list[str]]:

@@ -267,18 +267,39 @@ def generate(
     Raises:
         ArgumentError: the scene has no rooms, or too few valid questions.
     """
+    made = generate_available(world, count, seed, rules, first=first, before=before, attributes=attributes)
+    if len(made) < count:
+        raise ArgumentError(
+            f"{world.name}: only {len(made)} of {count} questions satisfy {rules}; request fewer per scene"
+        )
+    return made
+
+
+def generate_available(
+    world: World,
+    count: int | None,
+    seed: int,
+    rules: EpisodeRules = DEFAULT_RULES,
+    *,
+    first: int = 0,
+    before: Iterable[str] = (),
+    attributes: Attributes = NO_ATTRIBUTES,
+) -> list[Episode]:
+    """Return the same episodes as `generate`, or as many as there are; None for all.
+
+    Raises:
+        ArgumentError: the scene has no rooms.
+    """
     pool = list(questions_of(world.name, seed, rules, world.backend, attributes))
     draws = core.uniform(core.fold_key([place_key(seed, world.name), first]), len(pool))
     pool = [pool[i] for i in np.argsort(draws, kind="stable")]
     made: list[Answerable] = []
     tally: Counter[str] = Counter()
     texts = set(before)
-    while len(made) < count:
+    while count is None or len(made) < count:
         free = [each for each in pool if each.text not in texts and _within_limits(each, made, rules)]
         if not free:
-            raise ArgumentError(
-                f"{world.name}: only {len(made)} of {count} questions satisfy {rules}; request fewer per scene"
-            )
+            break
         chosen = min(
             free,
             key=lambda each: (
