@@ -36,10 +36,12 @@ from wiw.mapping.object_map import MapObject, ObjectMap
 from wiw.mapping.occupancy import OccupancyGrid
 from wiw.mapping.views import Views, place_cameras, unproject
 from wiw.perception.scene_labels import CATEGORIES, STATES, Labeller, SceneLabels
+from wiw.policies.base import Situation
 from wiw.policies.explorer import confidence
-from wiw.policies.explorer.answering import answer, list_wanted
+from wiw.policies.explorer.answering import Belief, answer, list_wanted
 from wiw.policies.explorer.destinations import Destination, _measure_way
 from wiw.policies.explorer.home import KNOWLEDGE, Home, Surface, believe_home, load_knowledge, to_table_frame
+from wiw.policies.explorer.memory import Memory
 from wiw.policies.explorer.policy import SURFACE_STRIDE, SURFACES, Explorer
 from wiw.policies.explorer.presuming import find_likeliest
 from wiw.runs.recipes import AgentRecipe, TaskRecipe
@@ -512,3 +514,19 @@ def test_what_lies_beyond_the_map_has_no_way():
     for offset in ([-5.0, 0.0], [0.0, -5.0], [-5.0, -5.0], [500.0, 0.0]):
         place = Destination(edge + offset, 0.0, radius=1.0)
         assert _measure_way(grid, distances, place) == np.inf
+
+
+@pytest.mark.parametrize("horizon", [1, 2, 3, 4, 8])
+@pytest.mark.parametrize("confidence", [0.1, 0.9])
+@pytest.mark.parametrize("places", [[], [(-2.0, 0.5)], [(50.0, 0.5)]])  # the last one cannot be reached
+def test_plans_are_no_longer_than_the_horizon(monkeypatch, horizon, confidence, places):
+    monkeypatch.setattr(Explorer, "__init__", lambda self: None)
+    explorer = Explorer()
+    explorer.sure, explorer.budget = 0.7, None
+    memory = Memory(None, ObjectMap(CATEGORIES, STATES))
+    memory.grid.add(np.full((144, 256), 3, np.float32), np.zeros(3))
+    memory.belief = Belief("red", confidence)
+    memory.destinations = [Destination(np.array(place), 1.0) for place in places]
+    situation = Situation(None, Goal("aeqa", text="q", question=True, budget=250), Key(0, 0), memory)
+    plans = explorer.propose([situation], 3, horizon)[0]
+    assert plans and all(1 <= len(plan.actions) <= horizon for plan in plans)

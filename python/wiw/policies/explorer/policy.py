@@ -39,6 +39,8 @@ SURFACE_STRIDE = 24
 """Pixels between the looks at floors and walls, along rows and columns."""
 LOOK_ACTIONS = 3
 """Maximum number of primitives of a plan that only takes a second look."""
+LOOK_AROUND = 4
+"""Left turns where no way leads anywhere: a quarter turn."""
 MOST_GAIN = 12.0
 """Square metres of new floor that count at most: one room. More would draw an agent to and fro across a home."""
 LAST_ACTIONS = 18
@@ -199,15 +201,17 @@ class Explorer(Policy):
     def _plan(self, situation: Situation, candidates: int, horizon: int) -> list[Proposal]:
         memory = situation.memory
         final = self.is_final(situation)
+        longest = min(LOOK_ACTIONS, horizon) if final else horizon
         plans: dict[bytes, Proposal] = {}
         for place in memory.destinations[: 1 if final else 2 * candidates]:
-            actions = plan_route(memory.grid, memory.pose, place, LOOK_ACTIONS if final else horizon)
+            actions = plan_route(memory.grid, memory.pose, place, longest)
             if len(actions):
                 plans.setdefault(actions.tobytes(), Proposal(actions, prior=place.worth, note=place.note))
             if len(plans) == candidates:
                 break
-        if not plans:  # nowhere to go: another look from here, a quarter turned
-            plans[b""] = Proposal(np.full(1 if final else 4, TURN_LEFT, np.int8), note="look around")
+        if not plans:  # nowhere to go: another look from here
+            turns = np.full(1 if final else min(LOOK_AROUND, horizon), TURN_LEFT, np.int8)
+            plans[b""] = Proposal(turns, note="look around")
         return sorted(plans.values(), key=lambda plan: -plan.prior)
 
     def _rate(self, memory: Memory, place: Destination, metres: float) -> float:
