@@ -223,6 +223,24 @@ def test_the_matcher_reads_panoramas_of_other_sizes(size: tuple[int, int]) -> No
     assert len(policy.propose([situation], 3, 5)[0]) == 3
 
 
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [
+        ({"reach": 0}, "expected reach above 0, got 0"),
+        ({"gate_width": 0.0}, "expected gate_width above 0, got 0"),
+        ({"gate_width": float("nan")}, "expected gate_width above 0, got nan"),
+        ({"travel": -0.1}, "expected travel of 0 or more, got -0.1"),
+        ({"spread": 0}, "spread must be positive, got 0"),
+        ({"calm": 1.5}, "expected calm of at most 1 .*, got 1.5"),
+        ({"gate": float("inf")}, "a number for gate, got .* and inf"),
+    ],
+)
+def test_options_of_the_matcher_that_make_no_sense_are_refused(options: dict[str, float], message: str) -> None:
+    with pytest.raises(ArgumentError, match=f"policy matcher: .*{message}"):
+        Matcher(**options)
+    assert Matcher(gate=-1.0, travel=0, calm=1).options.travel == 0
+
+
 @pytest.mark.parametrize("name", ["matcher", "climber", "geometric"])
 def test_a_goal_without_an_image_is_refused(name: str) -> None:
     with pytest.raises(ArgumentError, match=f"policy {name}: expected a goal image, got none in task ar"):

@@ -16,7 +16,7 @@ from wiw.errors import ArgumentError
 from wiw.policies.base import FrameSpec, Policy, Situation
 from wiw.policies.matcher import appearance
 from wiw.policies.matcher.exploration import ExplorationMap
-from wiw.typed_values import read_values
+from wiw.typed_values import read_values, require_positive
 from wiw.types import Goal, Key, Proposal, Rollout
 
 HEADINGS = 16
@@ -58,6 +58,18 @@ class MatcherOptions:
     """Minimum difference between headings of imagined plans, in turns, when the goal is near."""
     reach: float = 1.0
     """Metres ahead at which a heading is evaluated."""
+
+    def __post_init__(self) -> None:
+        require_positive("policy matcher", self, "spread")
+        for name, value in vars(self).items():
+            if name in ("reach", "gate_width") and not 0 < value < np.inf:
+                raise ArgumentError(f"policy matcher: expected {name} above 0, got {value}")
+            if name != "gate" and not 0 <= value < np.inf:
+                raise ArgumentError(f"policy matcher: expected {name} of 0 or more, got {value}")
+        if not (self.calm <= 1 and np.isfinite(self.gate)):
+            raise ArgumentError(
+                f"policy matcher: expected calm of at most 1 and a number for gate, got {self.calm} and {self.gate}"
+            )
 
 
 @dataclass
