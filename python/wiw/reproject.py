@@ -56,7 +56,7 @@ def warp(
 
     Args:
         color: uint8 [B, H, W, 3].
-        depth: float32 [B, H, W].
+        depth: float32 [B, H, W], or another floating type.
         T_source_target: [B, T, 4, 4], pose of each new camera in the frame of its source (see :func:`pose`).
         hfov_deg: None for panoramas; for perspective views their horizontal field of view between pixel edges.
         size: (h, w) of the results; None means the source's.
@@ -73,6 +73,12 @@ def warp(
     color = np.asarray(color)
     if color.dtype != np.uint8 or color.ndim != 4:
         raise ArgumentError(f"color: expected uint8 [B, H, W, 3], got {color.dtype} {list(color.shape)}")
+    depth = np.asarray(depth)
+    if not np.issubdtype(depth.dtype, np.floating):
+        raise ArgumentError(
+            f"depth: expected metres in a floating type, got {depth.dtype}; convert it first, such as millimetres by "
+            "depth.astype(np.float32) / 1000"
+        )
     if unknown := [name for name in outputs if name not in OUTPUTS]:
         raise ArgumentError(f"outputs: expected any of {OUTPUTS}, got {unknown}")
     source = (int(color.shape[1]), int(color.shape[2]))

@@ -195,6 +195,9 @@ def test_errors_say_what_was_expected():
         reproject.warp(color[None] / 255, depth[None], np.eye(4)[None, None])
     with pytest.raises(ArgumentError, match="color: expected uint8"):
         reproject.warp(color, depth, np.eye(4)[None, None])
+    for integers in (np.uint16, np.int64):  # millimetres, as cameras write them, are no metres
+        with pytest.raises(ArgumentError, match=r"depth: expected metres in a floating type, got u?int.* / 1000"):
+            reproject.warp(color[None], (1000 * depth[None]).astype(integers), np.eye(4)[None, None])
     with pytest.raises(ArgumentError, match="outputs"):
         reproject.warp(color[None], depth[None], np.eye(4)[None, None], outputs=("holes",))
     with pytest.raises(ArgumentError, match="T_source_target"):
