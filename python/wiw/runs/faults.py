@@ -3,6 +3,7 @@
 
 from __future__ import annotations
 
+import shlex
 import sqlite3
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -30,12 +31,18 @@ def explain_faults(path: Path, home: Path | None = None) -> Iterator[None]:
         raise StoreError(f"{path}: {error}; {find_remedy(path, 'malformed', home)}") from error
 
 
+def write_resume_command(run: Path, scratch: str | Path | None = None) -> str:
+    """Return the command that resumes the run in a folder, written on a local disk as it was before."""
+    return shlex.join(["wiw", "resume", str(run), *([] if scratch is None else ["--scratch", str(scratch)])])
+
+
 def find_remedy(path: Path, error: str, home: Path | None = None) -> str:
     """Return what was expected of the run store at `path` and what to do, given the text of an SQLite error."""
     if any(words in error for words in _UNWRITTEN):
+        scratch = None if home in (None, path) else path.parent.parent
         return (
             f"expected {path.parent} to be writable, with free space. Everything recorded so far is kept: make room, "
-            f"then `wiw resume {(home or path).parent}`"
+            f"then `{write_resume_command((home or path).parent, scratch)}`"
         )
     if any(words in error for words in _DAMAGED):
         return (

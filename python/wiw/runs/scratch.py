@@ -3,11 +3,13 @@
 
 The copy is made as episodes begin to be run, then at most once a minute, and when the store is closed: at the run's
 end, or when it is stopped. So a machine that is lost takes the episodes of a minute with it. A copy is complete or
-absent, and needs no log beside it, so it can be read anywhere.
+absent, and needs no log beside it, so it can be read anywhere. Where the last one fails, or the process is killed, the
+store on the local disk stays, and whoever resumes the run on that machine takes its rows in.
 """
 
 from __future__ import annotations
 
+import logging
 import os
 import shutil
 import sqlite3
@@ -17,14 +19,18 @@ from collections.abc import Iterator
 from contextlib import closing, contextmanager, suppress
 from hashlib import blake2b
 from pathlib import Path
+from typing import NamedTuple
 
-from wiw.errors import FileError
+from wiw.errors import FileError, StoreError
 from wiw.files import atomic_file
-from wiw.runs.faults import explain_faults
+from wiw.runs.faults import explain_faults, write_resume_command
 from wiw.runs.store_log import remove_log
 
 PERIOD = 60.0
 """Seconds between two copies."""
+RECORDED = ("outcome", "decision", "lost")
+"""Tables with rows once a run has recorded anything."""
+_log = logging.getLogger("wiw.runs")
 
 
 class ScratchCopy:
@@ -34,17 +40,47 @@ class ScratchCopy:
         own = home.expanduser().resolve()
         digest = blake2b(str(own).encode(), digest_size=6).hexdigest()
         self.home = home
-        self.path = choose_local_folder(scratch).expanduser().resolve() / f"{own.parent.name}-{digest}" / own.name
+        self.folder = choose_local_folder(scratch).expanduser().resolve()
+        self.given = "auto" if str(scratch) == "auto" else str(self.folder)
+        self.path = self.folder / f"{own.parent.name}-{digest}" / own.name
         self._copied = time.monotonic()
 
+    @property
+    def resume_command(self) -> str:
+        """Command that resumes the run here."""
+        return write_resume_command(self.home.parent, self.given)
+
+    def holds_run(self) -> bool:
+        """Return whether an earlier process has left a store here.
+
+        Raises:
+            StoreError: it cannot be read.
+        """
+        return self._count_left() is not None
+
+    def require_no_rows(self) -> None:
+        """Check that no earlier process has left rows here, which a new run would replace.
+
+        Raises:
+            StoreError: there are some, or what is here cannot be read.
+        """
+        left = self._count_left()
+        if left is not None and left.rows:
+            raise StoreError(
+                f"{self.path} has rows of a run that were not copied to {self.home.parent}; expected none where a run "
+                f"begins: continue that run with `{self.resume_command}`, or delete {self.path.parent}"
+            )
+
     def fetch_store(self) -> None:
-        """Fetch the store from its home, unless a killed process has left more of the same run here.
+        """Fetch the store from its home, unless an earlier process has left more of the same run here, or all of it.
 
         The caller holds the locks of both, and has taken in the log at home (`take_in_log`).
 
         Raises:
-            StoreError: the store at home cannot be read, or the one here cannot be written.
+            StoreError: the store at home cannot be read, the one here cannot be written, or has rows of another run.
         """
+        if not self.home.exists() and self.holds_run():
+            return
         with explain_faults(self.home), closing(_open(self.home, "ro")) as source:
             if self._has_more_than(source):
                 return
@@ -53,9 +89,14 @@ class ScratchCopy:
                 source.backup(target)
 
     def copy_if_due(self, connection: sqlite3.Connection) -> None:
-        """Copy the store home if the last time was long enough ago."""
-        if time.monotonic() - self._copied >= PERIOD:
+        """Copy the store home if the last time was long enough ago; where that fails, warn, and try again later."""
+        if time.monotonic() - self._copied < PERIOD:
+            return
+        try:
             self.copy(connection)
+        except (FileError, StoreError) as error:  # the rows are here, and home may have room again before the end
+            _log.warning("the run goes on in %s, but cannot be copied home now: %s", self.path, error.__cause__)
+            self._copied = time.monotonic()
 
     def copy(self, connection: sqlite3.Connection) -> None:
         """Copy the store home.
@@ -67,9 +108,15 @@ class ScratchCopy:
         draft = self.path.with_name(f"{self.path.name}.copy")
         with explain_faults(draft, self.home):
             write_whole(connection, draft)
-        with atomic_file(self.home) as file:
-            shutil.copyfile(draft, file)
-            remove_log(self.home)  # else SQLite would apply it to the copy
+        try:
+            with atomic_file(self.home) as file:
+                shutil.copyfile(draft, file)
+                remove_log(self.home)  # else SQLite would apply it to the copy
+        except (FileError, StoreError) as error:
+            raise type(error)(
+                f"{error}. Everything recorded is in {self.path}; once the cause is fixed, `{self.resume_command}` "
+                "continues with it"
+            ) from error
         draft.unlink()
         self._copied = time.monotonic()
 
@@ -86,14 +133,30 @@ class ScratchCopy:
             self.path.parent.rmdir()
 
     def _has_more_than(self, home: sqlite3.Connection) -> bool:
+        left, kept = self._count_left(), _count_rows(home)
+        if left is None:
+            return False
+        if left.begun != kept.begun and left.rows:
+            raise StoreError(
+                f"{self.path} has rows of another run that were not copied to {self.home.parent}; expected rows of "
+                f"the run that is there: delete {self.path.parent}, or give another folder with --scratch (scratch=)"
+            )
+        return left.begun == kept.begun and (left.done, left.rows) > (kept.done, kept.rows)
+
+    def _count_left(self) -> _Count | None:
+        """Return how far the store is that an earlier process has left here; None if there is no whole one."""
         if not self.path.is_file():
-            return False
-        try:
-            with closing(_open(self.path, "rw")) as left:  # takes in what is in its log
-                (begun, ended), (begun_here, ended_here) = _count_ended(home), _count_ended(left)
-        except sqlite3.DatabaseError:  # cut off while it was fetched
-            return False
-        return begun_here == begun and ended_here > ended
+            return None
+        with explain_faults(self.path, self.home):
+            try:
+                with closing(_open(self.path, "rw")) as left:  # takes in what is in its log
+                    return _count_rows(left)
+            except sqlite3.OperationalError as error:
+                if "no such table" not in str(error):  # the disk may be full
+                    raise
+            except sqlite3.DatabaseError:
+                pass
+        return None  # cut off while it was created or fetched
 
 
 def choose_local_folder(given: str | Path) -> Path:
@@ -132,11 +195,21 @@ def write_whole(connection: sqlite3.Connection, path: Path) -> None:
         target.execute("PRAGMA journal_mode = DELETE")
 
 
-def _count_ended(store: sqlite3.Connection) -> tuple[str, int]:
-    """Return when the run began, and how many episodes have ended without an error."""
+class _Count(NamedTuple):
+    """How far a store is."""
+
+    begun: str
+    """When its run began."""
+    done: int
+    """Number of episodes that have ended without an error."""
+    rows: int
+    """Number of all rows that its run recorded."""
+
+
+def _count_rows(store: sqlite3.Connection) -> _Count:
     (begun,) = store.execute("SELECT created FROM run").fetchone()
-    (ended,) = store.execute("SELECT count(*) FROM outcome WHERE status = 'done'").fetchone()
-    return begun, ended
+    (done,) = store.execute("SELECT count(*) FROM outcome WHERE status = 'done'").fetchone()
+    return _Count(begun, done, sum(store.execute(f"SELECT count(*) FROM {table}").fetchone()[0] for table in RECORDED))
 
 
 def _open(path: Path, mode: str) -> sqlite3.Connection:

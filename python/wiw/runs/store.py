@@ -12,7 +12,7 @@ import math
 import re
 import sqlite3
 from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
-from contextlib import contextmanager, suppress
+from contextlib import ExitStack, contextmanager, suppress
 from datetime import datetime, timezone
 from pathlib import Path
 from typing import Any
@@ -22,12 +22,12 @@ from wiw import benchmark
 from wiw.errors import ArgumentError, StoreError
 from wiw.file_systems import find_network
 from wiw.runs import configurations
-from wiw.runs.faults import explain_faults, find_remedy
+from wiw.runs.faults import explain_faults, find_remedy, write_resume_command
 from wiw.runs.judges import JudgedRow, JudgeRecord, apply_judge, find_judge
 from wiw.runs.migrations import OLDEST_READABLE, is_newer, migrate, show_as_current
 from wiw.runs.processes import describe_process
 from wiw.runs.rows import AgentRow, DecisionRow, LostRow, OutcomeRow, build_episode, to_episode_values, to_json
-from wiw.runs.scratch import ScratchCopy
+from wiw.runs.scratch import RECORDED, ScratchCopy
 from wiw.runs.shapes import EDITED, check_decision, check_types, parse_column
 from wiw.runs.shards import Shard
 from wiw.runs.store_file import (
@@ -104,7 +104,8 @@ class RunStore:
             version: of wiw that ran it; this one if not given.
 
         Raises:
-            StoreError: a run is already there, or the folder cannot be written or is on a network file system.
+            StoreError: a run is already there, the folder cannot be written or is on a network file system, or rows
+                of an earlier run are in `scratch` that were not copied.
         """
         copy = None if scratch is None else ScratchCopy(store_path(run), Path(scratch))
         path = store_path(run) if copy is None else copy.path
@@ -114,9 +115,7 @@ class RunStore:
                 "evaluate(..., resume=True)), or give another output folder"
             )
         make_folder(store_path(run))
-        lock = lock_store(path) if copy is None else lock_both(copy)
-        if copy is not None:
-            copy.discard()
+        lock = lock_store(path) if copy is None else cls._clear_scratch(copy)
         store = cls(path, connect(path, lock), lock, copy)
         with store._close_on_error():
             store._fill(created or _format_now(), version or wiw.__version__, config, info, episodes)
@@ -178,8 +177,9 @@ class RunStore:
                 network file system.
         """
         path = store_path(run)
-        if scratch is not None and path.exists():
-            store = cls._open_scratch_copy(ScratchCopy(path, Path(scratch)))
+        copy = None if scratch is None else ScratchCopy(path, Path(scratch))
+        if copy is not None and (path.exists() or copy.holds_run()):
+            store = cls._open_scratch_copy(copy)
         else:
             store = cls._open(path, lock_store(path) if path.exists() else None, continues=True)
         with store._close_on_error():
@@ -251,6 +251,14 @@ class RunStore:
         """
         path = store_path(run)
         return cls._open(path, lock_store(path) if path.exists() else None)
+
+    @staticmethod
+    def _clear_scratch(copy: ScratchCopy) -> ExitStack:
+        """Lock a store that begins on a local disk, and remove what an earlier process has left there."""
+        with lock_both(copy) as lock:
+            copy.require_no_rows()
+            copy.discard()
+            return lock.pop_all()
 
     @classmethod
     def _open_scratch_copy(cls, copy: ScratchCopy) -> RunStore:
@@ -327,6 +335,18 @@ class RunStore:
     def home(self) -> Path:
         """The file in the run's own folder; `path` is another where the store is written on a local disk."""
         return self.path if self._copy is None else self._copy.home
+
+    @property
+    def left(self) -> Path | None:
+        """The file on a local disk, of a store that is written there; None once it is copied home and removed."""
+        return None if self._copy is None or not self._copy.path.is_file() else self._copy.path
+
+    @property
+    def resume_command(self) -> str:
+        """Command that resumes the run, on the local disk that it is written on if it is."""
+        if self._copy is not None:
+            return self._copy.resume_command
+        return write_resume_command(self.path.parent)
 
     # -- what the run is -------------------------------------------------------------------------------------------
 
@@ -438,6 +458,10 @@ class RunStore:
         """Return how many episodes of all arms have ended, and how many of these with an error."""
         (counted,) = self._rows("SELECT count(*) AS n, coalesce(sum(status = 'error'), 0) AS errors FROM outcome")
         return counted["n"], counted["errors"]
+
+    def has_rows(self) -> bool:
+        """Return whether anything of the run is recorded: an ended episode, a decision, or what one had spent."""
+        return any(self._rows(f"SELECT 1 FROM {table} LIMIT 1") for table in RECORDED)
 
     def decisions(self, arm: str | None = None, episode: int | None = None) -> list[dict[str, Any]]:
         """Return the decisions of ended episodes in order, of all or of one arm or episode."""
@@ -768,7 +792,7 @@ class RunStore:
     # -- inside ----------------------------------------------------------------------------------------------------
 
     def _end(self, keep: bool) -> None:
-        copy, self._copy = self._copy, None
+        copy = None if self._lock is None else self._copy  # closed before
         try:
             if copy is not None and keep:
                 copy.copy(self._connection)
@@ -834,19 +858,16 @@ def leave_resumable(begun: RunStore) -> Iterator[None]:
     So a wrong token or missing weights leave no run behind that can neither be begun again nor resumed. An
     interruption leaves it.
     """
-    path = begun.home
+    command = begun.resume_command
     try:
         yield
     except Exception as error:
-        with suppress(StoreError), RunStore.read(path) as store:
-            (counted,) = store._rows(
-                "SELECT (SELECT count(*) FROM decision) + (SELECT count(*) FROM outcome) + (SELECT count(*) FROM lost) "
-                "AS n"
-            )
-            if counted["n"] == 0:
-                remove_store(path)
+        with suppress(StoreError), RunStore.read(begun.left or begun.home) as store:
+            if begun.left is None and not store.has_rows():  # home may lack rows that are left on the local disk
+                remove_store(begun.home)
             elif store.info["task"] is not None:  # else it was begun with objects, and no command can resume it
-                note = f"Everything recorded is kept. Once the cause is fixed:  wiw resume {path.parent}"
+                place = "" if begun.left is None else f" in {begun.left}"
+                note = f"Everything recorded is kept{place}. Once the cause is fixed:  {command}"
                 vars(error).setdefault("__notes__", []).append(note)  # as `add_note` of Python 3.11 does
         raise
 

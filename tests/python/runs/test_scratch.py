@@ -3,10 +3,13 @@
 
 from __future__ import annotations
 
+import errno
+import logging
+import os
 import shutil
 import sqlite3
-from collections.abc import Iterable
-from contextlib import closing
+from collections.abc import Iterable, Iterator
+from contextlib import closing, contextmanager
 from pathlib import Path
 from typing import Any
 
@@ -14,16 +17,20 @@ import pytest
 from fakes import LineTask
 
 import wiw
-from wiw.errors import StoreError
+from wiw.errors import FileError, StoreError
+from wiw.runs import scratch
 from wiw.runs.rows import OutcomeRow
 from wiw.runs.status import _read_time
-from wiw.runs.store import RunStore
+from wiw.runs.store import RunStore, leave_resumable
 from wiw.runs.store_log import has_log
 from wiw.types import EpisodeResult
 
 COUNT = 60
 CONFIG = {"task": {"task": "line"}, "seed": 0, "episodes": COUNT, "arms": [{"name": "none", "agent": {}}]}
 INFO: dict[str, Any] = {"pictures": [], "task": None, "agents": {"none": None}, "live": 1, "workers": 1, "limits": {}}
+
+FILL = {"a": "b" * 500}
+"""What makes an outcome take a good part of a page."""
 
 
 def create(home: Path, scratch: Path | None = None, **info: Any) -> RunStore:
@@ -32,8 +39,30 @@ def create(home: Path, scratch: Path | None = None, **info: Any) -> RunStore:
 
 def write(store: RunStore, episodes: Iterable[int]) -> None:
     for number in episodes:
-        result = EpisodeResult(number, f"{number:04d}", "line/0", "done", {"success": 1.0}, 1.5, details={"": "b" * 500})
+        result = EpisodeResult(number, f"{number:04d}", "line/0", "done", {"success": 1.0}, 1.5, details=FILL)
         store.write(OutcomeRow("none", result))
+
+
+@contextmanager
+def full_home() -> Iterator[None]:
+    """While this lasts, nothing can be copied home."""
+
+    def fill(source: Path, target: Path) -> None:
+        raise OSError(errno.EDQUOT, os.strerror(errno.EDQUOT))
+
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(scratch.shutil, "copyfile", fill)
+        yield
+
+
+def leave_rows(home: Path, local: Path, episodes: Iterable[int]) -> Path:
+    """Record episodes that are not copied home, as where a process is killed; return the file that has them."""
+    store = RunStore.resume(home, scratch=local) if RunStore.exists(home) else create(home, local)
+    store.begin_session()
+    write(store, episodes)
+    with full_home(), pytest.raises(FileError):
+        store.close()
+    return store.path
 
 
 def count(run: Path) -> int:
@@ -124,4 +153,129 @@ def test_a_log_that_just_goes_counts_as_none(tmp_path: Path, monkeypatch: pytest
     create(tmp_path / "run").close()
     path = tmp_path / "run/run.sqlite"
     monkeypatch.setattr(Path, "exists", lambda *_, **__: True)  # and it is gone right after
-    assert not has_log(path) and _read_time(path).timestamp() == path.stat().st_mtime
+    assert not has_log(path)
+    assert _read_time(path).timestamp() == pytest.approx(path.stat().st_mtime, abs=1e-3)
+
+
+def test_an_error_before_the_first_copy_of_a_row_leaves_the_rows(tmp_path: Path) -> None:
+    home, local = tmp_path / "run", tmp_path / "local"
+    store = create(home, local, task={"name": "line"})
+    with full_home_after_begin(store), pytest.raises(FileError) as caught, leave_resumable(store):
+        try:
+            write(store, range(5))
+            raise ValueError("no weights")
+        finally:
+            store.close()
+    assert str(store.path) in str(caught.value) and "expected" in str(caught.value)
+    command = f"wiw resume {home} --scratch {local}"
+    assert command in str(caught.value)
+    assert caught.value.__notes__ == [
+        f"Everything recorded is kept in {store.path}. Once the cause is fixed:  {command}"
+    ]
+    with pytest.raises(StoreError, match=r"already holds a run.*wiw resume"):
+        create(home, local)
+    with RunStore.resume(home, scratch=local) as again:
+        assert again.count_ended() == (5, 0)
+    assert count(home) == 5 and not list(local.iterdir())
+
+
+@contextmanager
+def full_home_after_begin(store: RunStore) -> Iterator[None]:
+    store.begin_session()
+    with full_home():
+        yield
+
+
+def test_an_error_before_any_row_leaves_no_run_behind(tmp_path: Path) -> None:
+    home, local = tmp_path / "run", tmp_path / "local"
+    store = create(home, local, task={"name": "line"})
+    with pytest.raises(ValueError, match="no weights"), leave_resumable(store):
+        try:
+            store.begin_session()
+            raise ValueError("no weights")
+        finally:
+            store.close()
+    assert not home.exists() and not list(local.iterdir())
+
+
+def test_a_run_that_was_never_copied_begins_again_or_goes_on(tmp_path: Path) -> None:
+    home, local = tmp_path / "run", tmp_path / "local"
+    store = create(home, local, task={"name": "line"})
+    with full_home(), pytest.raises(FileError), leave_resumable(store), store:
+        store.begin_session()
+    assert not RunStore.exists(home)
+    with RunStore.resume(home, scratch=local) as again:
+        assert again.count_ended() == (0, 0)
+    shutil.rmtree(home)
+    with full_home(), pytest.raises(FileError):
+        create(home, local).close()
+    create(home, local).close()
+    assert RunStore.exists(home)
+
+
+def test_a_copy_that_fails_meanwhile_is_tried_again(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+) -> None:
+    monkeypatch.setattr(scratch, "PERIOD", 0.0)
+    home = tmp_path / "run"
+    with create(home, tmp_path / "local") as store:
+        store.begin_session()
+        with full_home(), caplog.at_level(logging.WARNING, "wiw.runs"):
+            write(store, range(2))
+        assert count(home) == 0 and "quota" in caplog.text and str(store.path) in caplog.text
+        write(store, [2])
+        assert count(home) == 3
+
+
+@pytest.mark.parametrize("way", ["as printed"])
+def test_rows_that_a_process_left_are_taken_in(tmp_path: Path, way: str) -> None:
+    home, local = tmp_path / "run", tmp_path / "local"
+    leave_rows(home, local, range(5))
+    assert count(home) == 0
+    folder = {"as printed": local, "without a folder": None, "with another folder": tmp_path / "other"}[way]
+    with RunStore.resume(home, scratch=folder) as store:
+        assert store.count_ended() == (5, 0)
+        write(store, range(5, 10))
+    assert count(home) == 10 and not list(local.iterdir())
+
+
+def test_errors_and_decisions_that_a_process_left_are_taken_in(tmp_path: Path) -> None:
+    home, local = tmp_path / "run", tmp_path / "local"
+    store = create(home, local)
+    store.begin_session()
+    store.write(OutcomeRow("none", EpisodeResult(0, "0000", "line/0", "error", error="disk")))
+    with full_home(), pytest.raises(FileError):
+        store.close()
+    with RunStore.resume(home, scratch=local) as again:
+        assert again.count_ended() == (1, 1)
+
+
+def test_a_new_run_does_not_replace_rows_of_an_earlier_one(tmp_path: Path) -> None:
+    home, local = tmp_path / "run", tmp_path / "local"
+    left = leave_rows(home, local, range(5))
+    shutil.rmtree(home)
+    with pytest.raises(StoreError, match=f"{left} has rows.*wiw resume {home} --scratch {local}"):
+        create(home, local)
+    create(home).close()
+    with closing(sqlite3.connect(home / "run.sqlite")) as file, file:
+        file.execute("UPDATE run SET created = '2020-01-01T00:00:00+00:00'")
+    with pytest.raises(StoreError, match=f"{left} has rows of another run"):
+        RunStore.resume(home, scratch=local)
+    shutil.rmtree(home)
+    with RunStore.resume(home, scratch=local) as store:
+        assert store.count_ended() == (5, 0)
+    assert count(home) == 5
+
+
+def test_a_left_store_that_cannot_be_read_now_is_not_discarded(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    home, local = tmp_path / "run", tmp_path / "local"
+    left = leave_rows(home, local, range(5))
+    with monkeypatch.context() as patch:
+
+        def fail(store: sqlite3.Connection) -> None:
+            raise sqlite3.OperationalError("disk I/O error")
+
+        patch.setattr(scratch, "_count_rows", fail)
+        with pytest.raises(StoreError, match="disk I/O error"):
+            RunStore.resume(home, scratch=local)
+    assert left.exists()
