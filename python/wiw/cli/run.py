@@ -172,7 +172,7 @@ def resume(
         workers: Number of processes. Default: as many as before.
         retry_errors: Whether to rerun episodes that ended with an infrastructure error.
         scratch: Folder on a local disk, such as /tmp, where the store is written during the run; needed if the run's
-            folder is on a network file system.
+            folder is on a network file system. What a killed process left in an earlier one is taken in.
         engine: As for `wiw run`. Default: the engine it was started with.
         address: Ray cluster. Default: the one it was started with.
         report: Whether to write report.html at the end.
@@ -198,7 +198,7 @@ def finish(log: Any, report: bool, remark: str = "") -> int:
         for first in {episode["arm"]: episode for episode in reversed(errors)}.values():
             cause = printable(read_last_line(first["error"]))
             print(f"{first['arm']} episode {first['episode']}: {cause}", file=sys.stderr)
-        print(f"Once the cause is fixed:  wiw resume {log.path} --retry-errors", file=sys.stderr)
+        print(f"Once the cause is fixed:  {log.store.resume_command} --retry-errors", file=sys.stderr)
     print(f"\nset-up  {log.store.info.get('preparation_seconds', 0.0):.1f} s to prepare scenes and episodes")
     if log.store.shard is not None:
         print(f"shard   {log.store.shard}; merge all shards with `wiw merge`")

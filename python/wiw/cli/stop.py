@@ -98,13 +98,15 @@ def _guard(watch: int, done: threading.Event) -> None:
 
 def stoppable(work: Callable[[], Any], folder: Path, command: str = "resume") -> Any:
     """Run `work` on a run's folder; if it is stopped, print the command that resumes it."""
+    from wiw.runs.store import find_resume_command
     from wiw.runs.store_file import store_path
 
     try:
         return work()
     except BaseException as stop:
         if not isinstance(stop, Exception | SystemExit) and store_path(folder).exists():
-            print(f"\nstopped; everything so far is kept. Continue with:  wiw {command} {folder}", file=sys.stderr)
+            again = find_resume_command(folder) if command == "resume" else f"wiw {command} {folder}"
+            print(f"\nstopped; everything so far is kept. Continue with:  {again}", file=sys.stderr)
         raise
 
 

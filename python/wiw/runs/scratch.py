@@ -88,6 +88,22 @@ class ScratchCopy:
             with explain_faults(self.path, self.home), closing(sqlite3.connect(self.path)) as target:
                 source.backup(target)
 
+    def bring_home(self) -> None:
+        """Copy home what an earlier process has left here, if it is more of the same run, and remove it here.
+
+        The caller holds the locks of both, and has taken in the log at home.
+
+        Raises:
+            StoreError: one of them cannot be read, or the one here has rows of another run.
+            FileError: home cannot be written.
+        """
+        with explain_faults(self.home), closing(_open(self.home, "ro")) as home:
+            has_more = self._has_more_than(home)
+        if has_more:
+            with explain_faults(self.path, self.home), closing(_open(self.path, "rw")) as left:
+                self.copy(left)
+        self.remove()
+
     def copy_if_due(self, connection: sqlite3.Connection) -> None:
         """Copy the store home if the last time was long enough ago; where that fails, warn, and try again later."""
         if time.monotonic() - self._copied < PERIOD:

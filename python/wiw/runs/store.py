@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import json
 import math
+import os
 import re
 import sqlite3
 from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
@@ -111,7 +112,7 @@ class RunStore:
         path = store_path(run) if copy is None else copy.path
         if cls.exists(run):
             raise StoreError(
-                f"{store_path(run)} already holds a run; continue it with `wiw resume {store_path(run).parent}` (or "
+                f"{store_path(run)} already holds a run; continue it with `{find_resume_command(run)}` (or "
                 "evaluate(..., resume=True)), or give another output folder"
             )
         make_folder(store_path(run))
@@ -166,6 +167,8 @@ class RunStore:
     ) -> RunStore:
         """Open an existing store for writing and discard partial episodes.
 
+        Rows that an earlier process has left on a local disk are taken in first.
+
         Args:
             run: its folder.
             config: that the run must be of.
@@ -178,6 +181,7 @@ class RunStore:
         """
         path = store_path(run)
         copy = None if scratch is None else ScratchCopy(path, Path(scratch))
+        cls._bring_home(path, copy)
         if copy is not None and (path.exists() or copy.holds_run()):
             store = cls._open_scratch_copy(copy)
         else:
@@ -250,6 +254,7 @@ class RunStore:
             StoreError: missing, damaged, of another schema, or in use.
         """
         path = store_path(run)
+        cls._bring_home(path, None)
         return cls._open(path, lock_store(path) if path.exists() else None)
 
     @staticmethod
@@ -259,6 +264,25 @@ class RunStore:
             copy.require_no_rows()
             copy.discard()
             return lock.pop_all()
+
+    @classmethod
+    def _bring_home(cls, path: Path, copy: ScratchCopy | None) -> None:
+        """Copy home what an earlier process has left on a local disk, unless that is where `copy` is."""
+        left = cls._find_left(path)
+        if left is None or (copy is not None and copy.path == left.path):
+            return
+        with lock_both(left):
+            take_in_log(path)
+            left.bring_home()
+
+    @classmethod
+    def _find_left(cls, path: Path) -> ScratchCopy | None:
+        """Return what the last process to run episodes has left on a local disk of this machine; None if nothing."""
+        with suppress(StoreError), cls.read(path) as store:
+            folder = store._session.get("scratch_folder")
+            copy = None if folder is None else ScratchCopy(path, Path(str(folder)))
+            return copy if copy is not None and os.path.isfile(copy.path) else None  # noqa: PTH113 - never raises
+        return None
 
     @classmethod
     def _open_scratch_copy(cls, copy: ScratchCopy) -> RunStore:
@@ -343,10 +367,16 @@ class RunStore:
 
     @property
     def resume_command(self) -> str:
-        """Command that resumes the run, on the local disk that it is written on if it is."""
+        """Command that resumes the run, on the local disk that it is, or was last, written on."""
         if self._copy is not None:
             return self._copy.resume_command
-        return write_resume_command(self.path.parent)
+        return write_resume_command(self.path.parent, self._session.get("scratch"))
+
+    @property
+    def _session(self) -> dict[str, Any]:
+        """What `begin_session` has stored; empty if no episode was run yet."""
+        session = self.info.get("session")
+        return session if isinstance(session, dict) else {}
 
     # -- what the run is -------------------------------------------------------------------------------------------
 
@@ -696,6 +726,8 @@ class RunStore:
     def begin_session(self) -> None:
         """Store when and where episodes begin to be run, and how many have ended before, for `wiw status`."""
         session = {"begun": _format_now(), "ended": self.count_ended()[0], **describe_process()}
+        if self._copy is not None:
+            session |= {"scratch": self._copy.given, "scratch_folder": str(self._copy.folder)}
         with self._writing() as connection:
             connection.execute("UPDATE run SET info = ?", (to_json({**self.info, "session": session}),))
         if self._copy is not None:
@@ -870,6 +902,13 @@ def leave_resumable(begun: RunStore) -> Iterator[None]:
                 note = f"Everything recorded is kept{place}. Once the cause is fixed:  {command}"
                 vars(error).setdefault("__notes__", []).append(note)  # as `add_note` of Python 3.11 does
         raise
+
+
+def find_resume_command(run: str | Path) -> str:
+    """Return the command that resumes the run in a folder, as its store says."""
+    with suppress(StoreError), RunStore.read(run) as store:
+        return store.resume_command
+    return write_resume_command(store_path(run).parent)
 
 
 _SECRET = re.compile(r"(?<![\w-])(key|token)=[^,&\s]+")

@@ -6,6 +6,7 @@ from __future__ import annotations
 import errno
 import logging
 import os
+import shlex
 import shutil
 import sqlite3
 from collections.abc import Iterable, Iterator
@@ -17,11 +18,12 @@ import pytest
 from fakes import LineTask
 
 import wiw
+from wiw.cli.stop import Terminated, stoppable
 from wiw.errors import FileError, StoreError
 from wiw.runs import scratch
 from wiw.runs.rows import OutcomeRow
 from wiw.runs.status import _read_time
-from wiw.runs.store import RunStore, leave_resumable
+from wiw.runs.store import RunStore, find_resume_command, leave_resumable
 from wiw.runs.store_log import has_log
 from wiw.types import EpisodeResult
 
@@ -172,7 +174,7 @@ def test_an_error_before_the_first_copy_of_a_row_leaves_the_rows(tmp_path: Path)
     assert caught.value.__notes__ == [
         f"Everything recorded is kept in {store.path}. Once the cause is fixed:  {command}"
     ]
-    with pytest.raises(StoreError, match=r"already holds a run.*wiw resume"):
+    with pytest.raises(StoreError, match=f"already holds a run.*{command}"):
         create(home, local)
     with RunStore.resume(home, scratch=local) as again:
         assert again.count_ended() == (5, 0)
@@ -227,11 +229,12 @@ def test_a_copy_that_fails_meanwhile_is_tried_again(
         assert count(home) == 3
 
 
-@pytest.mark.parametrize("way", ["as printed"])
+@pytest.mark.parametrize("way", ["as printed", "without a folder", "with another folder"])
 def test_rows_that_a_process_left_are_taken_in(tmp_path: Path, way: str) -> None:
     home, local = tmp_path / "run", tmp_path / "local"
     leave_rows(home, local, range(5))
     assert count(home) == 0
+    assert find_resume_command(home) == f"wiw resume {home} --scratch {local}"
     folder = {"as printed": local, "without a folder": None, "with another folder": tmp_path / "other"}[way]
     with RunStore.resume(home, scratch=folder) as store:
         assert store.count_ended() == (5, 0)
@@ -248,6 +251,23 @@ def test_errors_and_decisions_that_a_process_left_are_taken_in(tmp_path: Path) -
         store.close()
     with RunStore.resume(home, scratch=local) as again:
         assert again.count_ended() == (1, 1)
+
+
+def test_a_judge_marks_what_a_process_left(tmp_path: Path) -> None:
+    home = tmp_path / "run"
+    leave_rows(home, tmp_path / "local", range(5))
+    with RunStore.annotate(home) as store:
+        assert store.count_ended() == (5, 0)
+
+
+def test_a_process_that_still_writes_is_not_robbed(tmp_path: Path) -> None:
+    home = tmp_path / "run"
+    with create(home, tmp_path / "local") as store:
+        store.begin_session()
+        write(store, range(5))
+        with pytest.raises(StoreError, match="being written by another process"):
+            RunStore.resume(home)
+    assert count(home) == 5
 
 
 def test_a_new_run_does_not_replace_rows_of_an_earlier_one(tmp_path: Path) -> None:
@@ -279,3 +299,33 @@ def test_a_left_store_that_cannot_be_read_now_is_not_discarded(tmp_path: Path, m
         with pytest.raises(StoreError, match="disk I/O error"):
             RunStore.resume(home, scratch=local)
     assert left.exists()
+
+
+@pytest.mark.parametrize(("given", "shown"), [("auto", "auto"), ("my disk", "'{}/my disk'")])
+def test_a_stopped_run_is_continued_where_it_was_written(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str], given: str, shown: str
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setenv("SLURM_TMPDIR", str(tmp_path / "job"))
+    home = tmp_path / "run"
+
+    def work() -> None:
+        with create(home, Path(given)) as store:
+            store.begin_session()
+            raise Terminated
+
+    with pytest.raises(Terminated):
+        stoppable(work, home)
+    said = capsys.readouterr().err
+    assert f"wiw resume {home} --scratch {shown.format(tmp_path)}\n" in said
+    assert RunStore.exists(shlex.split(said.partition(":  ")[2])[2])
+
+
+def test_a_run_without_a_scratch_folder_is_continued_without(tmp_path: Path) -> None:
+    home = tmp_path / "run"
+    with create(home, tmp_path / "local") as store:
+        store.begin_session()
+    with RunStore.resume(home) as store:
+        store.begin_session()
+    assert find_resume_command(home) == f"wiw resume {home}"
+    assert find_resume_command(tmp_path / "none") == f"wiw resume {tmp_path / 'none'}"
