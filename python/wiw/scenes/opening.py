@@ -11,13 +11,16 @@ from pathlib import Path
 from typing import Any
 
 from wiw import _core
-from wiw.errors import FileError
+from wiw.errors import ArgumentError, FileError
 from wiw.scenes import basis, isolated, store
 from wiw.scenes.apartments import apartment, apartment_table
 from wiw.scenes.scans import formats
 from wiw.scenes.specs import is_generated, parse_single
 
 Scene = _core.scene.Scene
+Folders = str | PathLike[str] | Sequence[str | PathLike[str]]
+"""One folder, or several."""
+UP_AXES = (None, "auto", "y", "z")
 
 MOST_MISSING = 0.05
 """Largest share of a scan's surface whose texture may be missing."""
@@ -35,8 +38,8 @@ def load(
     *,
     isolate: bool = True,
     limits: dict[str, int] | None = None,
-    texture_folders: Sequence[str | PathLike[str]] = (),
-    model_folders: Sequence[str | PathLike[str]] = (),
+    texture_folders: Folders = (),
+    model_folders: Folders = (),
 ) -> Scene:
     """Read a GLB, glTF, OBJ, PLY or DAE mesh, a Gazebo `.world` or `.sdf` file, or a real scan.
 
@@ -44,14 +47,14 @@ def load(
 
     Args:
         path: the file; `~` is expanded.
-        up: "y", "z" or None: by the file (COLLADA header; Y for glTF, OBJ and PLY; Z for scans and for names in HM3D's
-            layout). The rule that was used is `scene.attributes["up"]`.
+        up: "y", "z", or None and "auto": by the file (COLLADA header; Y for glTF, OBJ and PLY; Z for scans and for
+            names in HM3D's layout). The rule that was used is `scene.attributes["up"]`.
         ceiling: height in metres above the floor at which to close a scene that is open above.
         cache: cache the imported scene on disk (`$WIW_CACHE` or `~/.cache/wiw`), to be mapped the next time.
         isolate: import in a separate process, so that a file that crashes the reader raises FileError here.
         limits: raises or lowers the import limits: file_bytes, triangles, nodes, texture_pixels, texture_bytes.
-        texture_folders: folders searched for textures by base name, after the places next to the file.
-        model_folders: folders searched for a world's `model://`, before the places next to the file.
+        texture_folders: one or several folders searched for textures by base name, after the places next to the file.
+        model_folders: one or several folders searched for a world's `model://`, before the places next to the file.
 
     Whatever had to be left out, such as a missing texture, is logged and listed in `scene.warnings`.
 
@@ -63,12 +66,14 @@ def load(
     file = Path(path).expanduser().absolute()  # the cache is shared by processes with other working folders
     if not file.is_file():
         raise FileError(f"{file}: no such file; expected a mesh or a Gazebo world")
+    if up not in UP_AXES:  # here, as scans have readers of their own
+        raise ArgumentError(f"up must be 'auto', 'y' or 'z', got {up!r}")
     options = {
-        "up": up,
+        "up": None if up == "auto" else up,
         "ceiling": ceiling,
         "limits": limits or {},
-        "texture_folders": [str(Path(folder).expanduser().absolute()) for folder in texture_folders],
-        "model_folders": [str(Path(folder).expanduser().absolute()) for folder in model_folders],
+        "texture_folders": _list_folders(texture_folders),
+        "model_folders": _list_folders(model_folders),
     }
     if not basis.has_decoder():  # what is imported without it is another scene, and must not outlive its installation
         options["basis_decoder"] = False
@@ -79,6 +84,11 @@ def load(
     for warning in scene.warnings:
         _log.warning("%s: %s", scene.name, warning)
     return scene
+
+
+def _list_folders(folders: Folders) -> list[str]:
+    several = [folders] if isinstance(folders, str | PathLike) else folders
+    return [str(Path(folder).expanduser().absolute()) for folder in several]
 
 
 def _load(file: Path, options: dict[str, Any], cache: bool, isolate: bool) -> Scene:

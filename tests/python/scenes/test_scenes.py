@@ -306,6 +306,15 @@ def test_relative_folders_mean_those_of_the_working_folder(tmp_path: Path, monke
         assert scenes.load(mesh, isolate=False, texture_folders=["textures"]).texture_bytes == 4 * size * size
 
 
+@pytest.mark.parametrize("kind", [str, Path, lambda path: (path,)])
+def test_one_folder_may_be_given_by_itself(tmp_path: Path, kind: Any) -> None:
+    mesh = write_textured(tmp_path / "mesh", "photo.png")
+    write_image(tmp_path / "elsewhere" / "photo.png", 2)
+    folder = kind(tmp_path / "elsewhere")
+    scene = scenes.load(mesh, isolate=False, cache=False, texture_folders=folder, model_folders=folder)
+    assert scene.texture_bytes == 16 and not scene.warnings
+
+
 def test_a_relative_path_remembers_absolute_ones(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     mesh = write_textured(tmp_path / "mesh", "photo.png")
     time.sleep(0.02)
