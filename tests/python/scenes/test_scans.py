@@ -378,6 +378,16 @@ class TestReplica:
         with pytest.raises(FileError, match=rf"info_semantic\.json: {message}"):
             load(path)
 
+    @pytest.mark.parametrize("up", ["Y", "Z", "banana", "x", ""])
+    def test_an_axis_that_is_none_is_refused(self, tmp_path: Path, up: str) -> None:
+        with pytest.raises(ArgumentError, match=f"up must be 'auto', 'y' or 'z', got '{up}'"):
+            load(files.write_replica(tmp_path), up=up)
+
+    def test_the_axis_may_be_chosen(self, tmp_path: Path) -> None:
+        path = files.write_replica(tmp_path)
+        texts = {up: load(path, up=up).attributes["up"] for up in (None, "auto", "y", "z")}
+        assert texts == {None: "Z (Replica)", "auto": "Z (Replica)", "y": "Y (Replica)", "z": "Z (Replica)"}
+
     def test_what_cannot_be_drawn_is_refused(self, tmp_path: Path) -> None:
         path = files.write_replica(tmp_path)
         files.write_ply(path, 0.5, colors=False)
@@ -477,6 +487,9 @@ class TestSceneDataset:
         assert navmesh_file(str(path)) is None
         NavMesh.build(load(path)).save(tmp_path / "navmeshes/flat.navmesh")
         assert navmesh_file(str(path)) == tmp_path / "navmeshes/flat.navmesh"
+
+    def test_a_folder_may_be_called_like_a_pattern(self, tmp_path: Path) -> None:
+        assert load(files.write_scene_dataset(tmp_path / "homes [v2]*?")).instances
 
     def test_specs_name_the_scenes_of_the_dataset(self, tmp_path: Path) -> None:
         path = files.write_scene_dataset(tmp_path)

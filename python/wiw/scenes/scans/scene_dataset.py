@@ -102,8 +102,9 @@ class Dataset:
     def find_files(self, section: str, kind: str, ending: str) -> list[Path]:
         """Return the files that a section's patterns of one kind (".json", ".glb") name, in order."""
         found: dict[Path, None] = {}
+        here = Path(glob.escape(str(self.path.parent)))  # a folder's own name is no pattern
         for pattern in self.list_patterns(section).get(kind, []):
-            for match in sorted(glob.glob(str(self.path.parent / pattern))):  # noqa: PTH207 - may lead up, by ".."
+            for match in sorted(glob.glob(str(here / pattern))):  # noqa: PTH207 - may lead up, by ".."
                 place = Path(match)
                 files = sorted(place.glob(f"*{ending}")) if place.is_dir() else [place]
                 found |= {file: None for file in files if file.name.endswith(ending)}

@@ -79,7 +79,7 @@ def _origin(element: ET.Element) -> NDArray[np.float64]:
 def _motion(joint: ET.Element, value: float) -> NDArray[np.float64]:
     """Return what a joint does at a value."""
     result, axis = np.eye(4), joint.find("axis")
-    direction = _numbers(None if axis is None else axis.get("xyz"), 3) if axis is not None else np.array([1.0, 0, 0])
+    direction = np.array([1.0, 0, 0]) if axis is None else _numbers(axis.get("xyz"), 3)
     if joint.get("type") == "prismatic":
         result[:3, 3] = value * direction / np.linalg.norm(direction)
     elif joint.get("type") in ("revolute", "continuous"):
