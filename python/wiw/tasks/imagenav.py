@@ -191,7 +191,7 @@ def read_goal_image(path: Path) -> NDArray[np.uint8]:
     """Return the front view, uint8 [480, 480, 3], in the middle of a panorama of a goal.
 
     Raises:
-        FileError: no picture, or no panorama, which is about twice as wide as high.
+        FileError: no picture, or no panorama, which is about twice as wide as high, and even in width.
     """
     found = cv2.imread(str(path), cv2.IMREAD_COLOR)
     if found is None:
@@ -199,4 +199,7 @@ def read_goal_image(path: Path) -> NDArray[np.uint8]:
     height, width = found.shape[:2]
     if not 1.5 <= width / height <= 2.5:  # those of the loop have 576 x 1024 pixels
         raise FileError(f"{path}: expected a panorama, about twice as wide as high, got {height}x{width}")
-    return np.asarray(panorama.to_perspective(np.ascontiguousarray(found[..., ::-1]), GOAL_HFOV, GOAL_SIZE))
+    try:
+        return np.asarray(panorama.to_perspective(np.ascontiguousarray(found[..., ::-1]), GOAL_HFOV, GOAL_SIZE))
+    except ArgumentError as error:
+        raise FileError(f"{path}: expected a panorama: {error}") from error

@@ -239,6 +239,9 @@ def test_the_picture_of_a_published_goal_is_its_front_view(tmp_path: Path, two_r
     cv2.imwrite(str(tmp_path / "i.png"), image[:, :100])
     with pytest.raises(FileError, match="about twice as wide as high, got 576x100"):
         told.environment().begin(told.episode(0))
+    cv2.imwrite(str(tmp_path / "i.png"), cv2.resize(image, (1025, 513)))
+    with pytest.raises(FileError, match=r"i\.png: expected a panorama: .*even"):
+        told.environment().begin(told.episode(0))
 
 
 def test_a_picture_outside_the_files_folder_is_not_read(tmp_path: Path) -> None:
