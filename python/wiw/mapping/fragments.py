@@ -82,7 +82,7 @@ def find_fragments(
         ArgumentError: labels of another shape than the views, or of unknown categories.
     """
     category = _check_labels(views, labels, len(things))
-    wanted = np.where(things[category] & (views.depth > 0) & (labels.confidence >= least_confidence), category, 0)
+    wanted = np.where(things[category] & find_packable(views) & (labels.confidence >= least_confidence), category, 0)
     wanted[cut_depth_steps(wanted, views.depth)] = 0
     index = np.zeros(wanted.shape, np.int32)
     where, kinds = [0], [0]
@@ -130,6 +130,15 @@ def cut_depth_steps(category: NDArray[np.uint8], depth: NDArray[np.float32]) -> 
         edge = unlike > DEPTH_STEP * np.minimum(q[first], q[first + step])
         cut.ravel()[np.where(change < 0, first + step, first)[edge]] = True
     return cut
+
+
+def find_packable(views: Views) -> NDArray[np.bool_]:
+    """Return the pixels that show something so near the start that `pack_voxels` has a key for it: bool [N, H, W]."""
+    height, width = views.size
+    slant = np.sqrt(1 + (width**2 + height**2) / (2 * views.focal) ** 2)  # of the ray through a corner
+    away = np.linalg.norm(views.T_start_camera[:, :3, 3], axis=1)
+    most = ((_OFFSET * VOXEL - away) / slant).astype(np.float32)
+    return (views.depth > 0) & (views.depth < most[:, None, None])
 
 
 def pack_voxels(points: NDArray[np.float64]) -> NDArray[np.int64]:

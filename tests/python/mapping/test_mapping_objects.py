@@ -13,7 +13,7 @@ from mapping_tours import Tour, add_all, mapped, walk
 from numpy.typing import NDArray
 
 from wiw.errors import ArgumentError
-from wiw.mapping.fragments import VOXEL, cut_depth_steps, pack_voxels, split_voxels, unpack_voxels
+from wiw.mapping.fragments import VOXEL, cut_depth_steps, find_packable, pack_voxels, split_voxels, unpack_voxels
 from wiw.mapping.object_map import ObjectMap
 from wiw.mapping.views import (
     HFOV_DEG,
@@ -146,6 +146,27 @@ def test_a_step_of_depth_is_cut_and_a_slope_is_not() -> None:
     assert cut[:, :, 30].all() and cut.sum() == 40  # the farther pixel of each row
     slope = (1.0 / np.linspace(1.0, 0.2, 60, dtype=np.float32))[None, None].repeat(40, 1)  # a plane, seen obliquely
     assert not cut_depth_steps(category, slope).any()
+
+
+@pytest.mark.parametrize("away", [1700.0, 4e6, np.inf, np.nan])
+def test_what_is_too_far_for_a_voxel_is_in_no_fragment(away: float) -> None:
+    """Keys would wrap there, and the thing would stand somewhere near the start."""
+    objects, views = ObjectMap(NAMES), blank_views()
+    category = np.ones((4, *SIZE), np.uint8)
+    add_square(views, category, 2, (2.0, 0.0, 1.0), 0.25)
+    category[3, 20:60, 20:60], views.depth[3, 20:60, 20:60] = 3, away
+    with np.errstate(all="raise"):
+        owners = objects.add(views, labels_of(category))
+    assert [thing.category for thing in objects.objects] == ["chair"] and not owners[3, 20:60, 20:60].any()
+    assert not find_packable(views)[3, 20:60, 20:60].any() and find_packable(views)[:3].all()
+
+
+def test_pixels_within_half_a_kilometre_have_voxels() -> None:
+    views = blank_views(away=500.0)
+    everywhere = np.nonzero(find_packable(views))
+    assert len(everywhere[0]) == views.depth.size
+    points = unproject(views, *everywhere)
+    assert np.abs(unpack_voxels(pack_voxels(points)) - points).max() <= VOXEL / 2 + 1e-6
 
 
 # -- the map -----------------------------------------------------------------------------------------------------------

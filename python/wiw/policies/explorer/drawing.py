@@ -13,7 +13,7 @@ from PIL import Image, ImageDraw, ImageFont
 
 from wiw.action import to_trajectory
 from wiw.mapping.drawing import FREE, INK, Color, DrawnThing, Plan, draw_map
-from wiw.mapping.fragments import pack_voxels
+from wiw.mapping.fragments import find_packable, pack_voxels
 from wiw.mapping.landmarks import LEAST_SHARE, Landmark
 from wiw.mapping.marks import draw_marks
 from wiw.mapping.object_map import MapObject
@@ -103,7 +103,7 @@ def _find_owners(views: Views, things: Sequence[MapObject]) -> NDArray[np.int32]
     owners = np.zeros(views.depth.shape, np.int32)
     if not things:
         return owners
-    where = np.nonzero(views.depth > 0)
+    where = np.nonzero(find_packable(views))
     keys = np.concatenate([thing.voxels for thing in things])
     ids = np.concatenate([np.full(len(thing.voxels), thing.id, np.int32) for thing in things])
     order = np.argsort(keys, kind="stable")
