@@ -24,7 +24,8 @@ def merge(
 
     Stores of different runs are refused, naming the first difference. An episode found in several stores is taken from
     the first that has finished it; differing records are refused if equal ones are guaranteed, and counted otherwise.
-    Episodes that no store has are listed, and `wiw resume` runs them. See docs/many-machines.md.
+    Episodes that no store has are listed, and `wiw resume` runs them. A run at --out that was merged from the same
+    shards is replaced, unless it was resumed or judged since. See docs/many-machines.md.
 
     Args:
         stores: Folders of runs with --shard, or folders that contain them.

@@ -7,21 +7,26 @@ and `calls` as far as they depend on which episodes ran together, and what `info
 
 from __future__ import annotations
 
+import shutil
 from collections.abc import Iterator, Mapping, Sequence
-from contextlib import ExitStack
+from contextlib import ExitStack, contextmanager
 from dataclasses import asdict, dataclass
 from inspect import isfunction
 from pathlib import Path
 from typing import Any
 
 from wiw.errors import Error, StoreError
+from wiw.file_systems import find_network
+from wiw.files import atomic_file
 from wiw.registry import POLICIES, TASKS, WORLD_MODELS
 from wiw.runs.execute import draw_pictures, read_recipes
 from wiw.runs.pictures import drop_spare_pictures
 from wiw.runs.rows import to_json
-from wiw.runs.run import find_stores
+from wiw.runs.run import find_stores, list_marks
 from wiw.runs.scratch import make_local_folder
 from wiw.runs.store import RunStore
+from wiw.runs.store_file import lock_store, store_path
+from wiw.runs.store_log import remove_log
 from wiw.runs.verify import list_differences, read_facts
 from wiw.world_models.base import Requirements
 
@@ -78,15 +83,18 @@ def merge(stores: Sequence[str | Path], out: str | Path, scratch: str | Path | N
     be equal if that is guaranteed (built-in parts without weights, on machines of the same kind); otherwise differing
     ones are counted. Stores may still be in use, and episodes may be missing: `wiw resume` runs these.
 
+    A run at `out` that was merged from shards which are all among `stores` is replaced, unless it was resumed or judged
+    since.
+
     Args:
         stores: folders with a store, or with subfolders that have one.
-        out: folder of the merged run, on any disk; the store there is either complete or absent.
+        out: folder of the merged run, on any disk; the store there is either complete or absent, or as it was.
         scratch: folder on a local disk in which it is written first; by default the system's temporary folder.
 
     Raises:
         ArgumentError: no folder is given.
         StoreError: no store; manifests that differ, naming the difference; different records of an episode for which
-            equality is guaranteed; `out` already holds a run.
+            equality is guaranteed; `out` already holds another run.
         FileError: `out` or `scratch` cannot be written.
     """
     with ExitStack() as stack:
@@ -96,7 +104,8 @@ def merge(stores: Sequence[str | Path], out: str | Path, scratch: str | Path | N
         local = stack.enter_context(make_local_folder(scratch))
         created = min(part.created for part in parts)
         first, version = parts[0], parts[0].wiw_version
-        target = RunStore.create(out, first.config, _merge_info(parts), first.episodes(), local, created, version)
+        place = stack.enter_context(_choose_place(out, parts, local))
+        target = RunStore.create(place, first.config, _merge_info(parts), first.episodes(), local, created, version)
         try:
             for part, episodes in zip(parts, takes, strict=True):
                 target.take_episodes(part, episodes)
@@ -109,6 +118,47 @@ def merge(stores: Sequence[str | Path], out: str | Path, scratch: str | Path | N
         target.close()
     pending = {arm: count for arm, count in left.items() if count}
     return Merged(Path(out), len(parts), sum(map(len, takes)), pending, repeated, tuple(unlike), undrawn)
+
+
+@contextmanager
+def _choose_place(out: str | Path, parts: Sequence[RunStore], local: Path) -> Iterator[str | Path]:
+    """Yield where to write a merged run: `out`, or a folder whose store then replaces an earlier merge at `out`.
+
+    Raises:
+        StoreError: the run at `out` has what the new one would lack, or is in use.
+        FileError: it cannot be replaced.
+    """
+    if not RunStore.exists(out):
+        yield out
+        return
+    path, new = store_path(out), local / "merged"
+    with ExitStack() as locks:
+        if find_network(path) is None:
+            locks.callback(lock_store(path).close)
+        _require_replaceable(out, parts)
+        yield new
+        with atomic_file(path) as draft:
+            shutil.copyfile(store_path(new), draft)
+            remove_log(path)  # else SQLite would apply it to the new file
+
+
+def _require_replaceable(out: str | Path, parts: Sequence[RunStore]) -> None:
+    """Check that nothing of a merged run would be lost if its shards were merged again."""
+    with RunStore.read(out) as old:
+        info, marks = old.info, list_marks(old)
+        is_of_shards = "merged" in info and _read_manifest(old) == _read_manifest(parts[0])
+    before = {(each["shard"], each["created"]) for each in info.get("merged", [])}
+    now = {(part.info.get("shard"), part.created) for part in parts if part.shard is not None}
+    if not is_of_shards or not before <= now:
+        why = "was not merged from these shards"
+    elif "session" in info or not marks <= set().union(*map(list_marks, parts)):
+        why = "was resumed or judged since it was merged, of which its shards know nothing"
+    else:
+        return
+    raise StoreError(
+        f"{store_path(out)} already holds a run, which {why}; expected a folder without a run, or with one that was "
+        "merged from the same shards: give another output folder"
+    )
 
 
 def require_equal_manifests(stores: Sequence[RunStore]) -> None:

@@ -89,7 +89,8 @@ class Run:
 def find_stores(runs: Sequence[str | Path]) -> list[Path]:
     """Return the folders with a store, each once: the given ones, or for folders without a store their subfolders.
 
-    Stores inside that are being created, or whose creation was interrupted, are left out.
+    A run that was merged from shards in its subfolders stands for these, unless it was resumed or judged since. Stores
+    inside that are being created, or whose creation was interrupted, are left out.
 
     Raises:
         ArgumentError: no folder is given.
@@ -101,11 +102,47 @@ def find_stores(runs: Sequence[str | Path]) -> list[Path]:
     return list({store.resolve(): store for store in reversed(found)}.values())[::-1]
 
 
+def find_shards(run: str | Path) -> list[Path]:
+    """Return the shards in the subfolders of a run that was merged from such; none of other runs, or one resumed since.
+
+    Raises:
+        StoreError: one of the stores cannot be read.
+    """
+    path = Path(run).expanduser()
+    inside = _list_inside(path) if store_path(path).is_file() else []
+    if not inside:
+        return []
+    with RunStore.read(path) as store:
+        config, is_copy = store.config, "merged" in store.info and "session" not in store.info
+    return [folder for folder in inside if _is_shard(folder, config)] if is_copy else []
+
+
+def list_marks(store: RunStore) -> set[tuple[str, str, int]]:
+    """Return for which answers a store has marks of judges, as digest, arm and episode."""
+    return {(judge.digest, *key) for judge in store.judges for key in store.judged_outcomes(judge.digest)}
+
+
+def _is_shard(folder: Path, config: dict[str, Any]) -> bool:
+    """Return whether a store is a shard of a run of this configuration, rather than such as `wiw blame` keeps."""
+    with RunStore.read(folder) as store:
+        return store.shard is not None and store.config == config
+
+
+def _list_inside(run: Path) -> list[Path]:
+    return sorted(path.parent for path in run.glob(f"*/{FILE_NAME}") if RunStore.can_be_read(path.parent))
+
+
+def _has_marks(run: Path) -> bool:
+    with RunStore.read(run) as store:
+        return bool(list_marks(store))
+
+
 def _stores_of(run: Path) -> Iterator[Path]:
     if store_path(run).is_file():
-        yield run
+        shards = find_shards(run)
+        yield from shards if shards and not _has_marks(run) else [run]
         return
-    inside = sorted(path.parent for path in run.glob(f"*/{FILE_NAME}") if RunStore.can_be_read(path.parent))
+    inside = _list_inside(run)
     if not inside:
         raise StoreError(f"no run at {run}: expected a folder with {FILE_NAME} in it, or with folders of shards")
     yield from inside

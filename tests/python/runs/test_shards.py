@@ -22,7 +22,9 @@ from wiw.cli import main
 from wiw.errors import ArgumentError, FileError, StoreError
 from wiw.runs import scratch, store_file
 from wiw.runs.frame_scores import FrameScores
+from wiw.runs.judges import JudgedRow, JudgeRecord
 from wiw.runs.recipes import AgentRecipe, TaskRecipe
+from wiw.runs.run import list_marks
 from wiw.runs.shards import Shard
 from wiw.runs.store import RunStore
 from wiw.runs.store_file import store_path
@@ -65,10 +67,11 @@ def read_rows(run):
         return rows, store.execute("SELECT config FROM run").fetchone()[0]
 
 
-def run_shards(folder, count, **options):
-    for number in range(1, count + 1):
+def run_shards(folder, count, numbers=(), **options):
+    own = numbers or range(1, count + 1)
+    for number in own:
         begin(folder / str(number), shard=f"{number}/{count}", **options).close()
-    return [folder / str(number) for number in range(1, count + 1)]
+    return [folder / str(number) for number in own]
 
 
 @pytest.mark.parametrize(("episodes", "count"), [(7, 1), (7, 2), (7, 3), (7, 7), (100, 8), (3, 2)])
@@ -146,8 +149,87 @@ def test_the_command_line_runs_merges_and_compares(tmp_path, capsys):
     assert main(["verify", str(tmp_path / "merged")]) == 0
     assert main(["compare", str(tmp_path / "whole"), str(tmp_path / "merged")]) == 0
     assert read_rows(tmp_path / "merged") == read_rows(tmp_path / "whole")
-    assert main(["merge", str(tmp_path / "parts"), "--out", str(tmp_path / "merged")]) == 2
-    assert "already holds a run" in capsys.readouterr().err
+    assert main(["merge", str(tmp_path / "parts"), "--out", str(tmp_path / "whole")]) == 2
+    assert "already holds a run, which was not merged from these shards" in capsys.readouterr().err
+
+
+@pytest.fixture
+def merged(tmp_path):
+    """A run that was merged, in its own folder, from two of its three shards, before the third began."""
+    run_shards(tmp_path / "run", 3, numbers=(1, 2))
+    assert not wiw.merge([tmp_path / "run"], tmp_path / "run").complete
+    return tmp_path / "run"
+
+
+def test_shards_that_go_on_after_a_merge_are_shown_and_merged_again(merged, tmp_path, capsys):
+    """As `wiw submit` prints it, with the run's own folder as --out; before, the merged store hid its shards."""
+    opened = load_run(merged)  # whoever has the replaced run open goes on to see it
+    with RunStore.resume(merged / "2") as store:
+        store.discard("none", [2])
+    assert [(str(each.shard), each.ended, each.total) for each in wiw.status(merged).stores] == [
+        ("1/3", 2, 2),
+        ("2/3", 1, 2),
+    ]
+    resume_run(merged / "2", progress=False).close()
+    begin(merged / "3", shard="3/3").close()
+    found = wiw.status(merged)
+    assert (found.ended, found.total, found.missing, len(found.stores)) == (7, 7, (), 3)
+    assert main(["merge", str(merged), "--out", str(merged)]) == 0
+    assert "7 episodes from 3 stores" in capsys.readouterr().out
+    begin(tmp_path / "whole").close()
+    (rows, config), (whole, same) = read_rows(merged), read_rows(tmp_path / "whole")
+    assert rows.pop("lost") != whole.pop("lost"), "what the episode cost that was run again"
+    assert (rows, config) == (whole, same) and len(opened.episodes) == 4
+    assert [each["shard"] for each in load_run(merged).store.info["merged"]] == ["1/3", "2/3", "3/3"]
+    assert wiw.merge([merged], merged).complete and wiw.merge([merged], tmp_path / "other").stores == 3
+    assert {path.name for path in merged.iterdir()} <= {"1", "2", "3", "run.sqlite", "run.lock"}
+
+
+def test_a_merged_run_that_was_resumed_is_not_replaced(merged):
+    resume_run(merged, progress=False).close()
+    before = read_rows(merged)
+    assert [each.shard for each in wiw.status(merged).stores] == [None]
+    with pytest.raises(StoreError, match="already holds a run, which was resumed or judged since"):
+        wiw.merge([merged / "1", merged / "2"], merged)
+    with pytest.raises(StoreError, match="already holds a run"):
+        wiw.merge([merged], merged)
+    assert read_rows(merged) == before
+
+
+def test_a_merged_run_that_was_judged_is_not_replaced(merged, tmp_path):
+    with RunStore.annotate(merged) as store:
+        store.add_judge(JudgeRecord({"judge": "strict"}))
+        store.write_judged(JudgedRow(store.judges[0].digest, "none", 0, {"success": 0.0}, {}))
+    assert len(wiw.status(merged).stores) == 2  # they may go on, whoever judges
+    with pytest.raises(StoreError, match="already holds a run, which was resumed or judged since"):
+        wiw.merge([merged / "1", merged / "2"], merged)
+    wiw.merge([merged], tmp_path / "other")
+    assert len(list_marks(load_run(tmp_path / "other").store)) == 1
+
+
+def test_a_merged_run_is_replaced_by_all_of_its_own_shards_alone(merged, tmp_path):
+    before = read_rows(merged)
+    again, others = run_shards(tmp_path / "again", 3), run_shards(tmp_path / "others", 3, seed=4)
+    for store in again:
+        edit(store, "UPDATE run SET created = '2020-01-01T00:00:00+00:00'")
+    for stores in (again, others, [merged / "1"]):
+        with pytest.raises(StoreError, match="already holds a run, which was not merged from these shards"):
+            wiw.merge(stores, merged)
+    assert read_rows(merged) == before
+
+
+def test_a_merged_run_that_is_in_use_or_cannot_be_written_stays(merged, monkeypatch):
+    before = read_rows(merged)
+    with RunStore.annotate(merged), pytest.raises(StoreError, match="is being written by another process"):
+        wiw.merge([merged], merged)
+
+    def fail(path):
+        raise OSError(28, "No space left on device")
+
+    monkeypatch.setattr("wiw.runs.merge.remove_log", fail)  # the last step before the file is replaced
+    with pytest.raises(FileError, match="No space left"):
+        wiw.merge([merged], merged)
+    assert read_rows(merged) == before
 
 
 def test_missing_episodes_are_named_and_can_be_run(tmp_path, capsys):

@@ -291,6 +291,8 @@ def test_shards_with_errors_are_submitted_again_when_asked(tmp_path, capsys):
     assert (before.ended, before.errors) == (6, 1), logs(out)
     assert submit(out, scenes="broken") == 0
     assert "nothing to submit\n1 episodes ended with an error: once" in capsys.readouterr().out
+    assert main(["merge", str(out), "--out", str(out)]) == 0  # as it is printed, before and after the second round
+    assert wiw.status(out) == before
     assert submit(out, "--retry-errors", scenes="broken") == 0
     lines = [shlex.split(line)[1:] for line in capsys.readouterr().out.splitlines() if line.startswith("wiw ")]
     assert [line[:3] for line in lines] == [["resume", str(out / "shard-1-of-2"), "--retry-errors"]]
@@ -298,6 +300,7 @@ def test_shards_with_errors_are_submitted_again_when_asked(tmp_path, capsys):
     after = wiw.status(out)
     assert (after.ended, after.errors) == (6, 1) and after.stores[0].written > before.stores[0].written, logs(out)
     assert after.stores[1].written == before.stores[1].written
+    assert main(["merge", str(out), "--out", str(out)]) == 0
     assert submit(out, scenes="broken") == 0  # as before: retries are no other flags
 
 
