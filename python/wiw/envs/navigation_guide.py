@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from wiw.action import FORWARD, TURN_LEFT, TURN_RIGHT, ActionSpace
+from wiw.action import FORWARD, STOP, TURN_LEFT, TURN_RIGHT, ActionSpace
 from wiw.envs.base import Guide
 from wiw.envs.episode_state import EpisodeState, NavigationSpec
 
@@ -96,12 +96,12 @@ class NavigationGuide(Guide):
     path: ShortestPath
 
     def evaluate_plan(self, plan: Sequence[int] | NDArray[np.int8]) -> float:
-        """Return the task's progress at a plan's end, or at the first primitive that gets all the way."""
+        """Return the task's progress at a plan's end, at a stop, or at the first primitive that gets all the way."""
         probe, found = self.fork.fork(), -np.inf
         for action in plan:
             probe.step(int(action))
             found = self.task.measure_progress(self.state, probe, self.path.count_primitives(probe))
-            if found >= self.task.complete_progress:
+            if action == STOP or found >= self.task.complete_progress:
                 break
         return found
 

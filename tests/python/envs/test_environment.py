@@ -140,6 +140,13 @@ def test_stop_ends_the_episode(env) -> None:
     assert terminated and reward == 0 and info["result"]["success"] == 0
 
 
+def test_what_follows_a_stop_in_a_plan_is_worth_nothing(env) -> None:
+    start_at(env, (1.0, 0.0, 1.0), -np.pi / 2)
+    guide = env.guide()
+    assert guide.evaluate_plan([STOP, *[FORWARD] * 4]) == guide.evaluate_plan([STOP])
+    assert guide.evaluate_plan([FORWARD] * 4) > guide.evaluate_plan([STOP])
+
+
 def test_a_fork_moves_alone(env) -> None:
     env.reset(options={"episode": 0})
     before = env.truth().position
