@@ -16,6 +16,7 @@ from wiw.judging.words import (
 )
 
 __all__ = [
+    "affirms_words",
     "cut_after_last_period",
     "find_concepts",
     "find_negated",
@@ -49,6 +50,10 @@ _VERBS = _FORMS_OF_BE | _NOTICED - {"any"} | {"do", "does", "think"}
 """Words of which a statement has one; "it" alone affirms nothing."""
 _OPPOSITES = (("open", "closed"), ("on", "off"), ("made", "unmade"))
 OPPOSITE_STATES = {one: other for pair in _OPPOSITES for one, other in (pair, pair[::-1])}
+_UNCOUNTED = _UNSURE | {"know", "tell", "sure", "certain", "idea", "count", "many", "much"}
+"""Words of an answer with "not" that is no zero: "I do not know", "no idea", "not many"."""
+_AMOUNTS = frozenset({"few", "lot", "number", "bunch", "handful", "several", "some", "little", "lots"})
+"""Words behind an article that is no number: "a few chairs", "a small number"."""
 _PAIRS = frozenset({"couple", "pair", "both"})
 _LEADS = (["there", "is"], ["i", "see"], ["i", "found"])
 """Words before the article of a single thing: "there is a chair"."""
@@ -101,6 +106,16 @@ def find_negated(text: str, kinds: Sequence[Kind]) -> list[Concept]:
     return list(dict.fromkeys(found))
 
 
+def affirms_words(text: str, words: str) -> bool:
+    """Return whether a text says some words, of which no concept need be known, and does not deny them before."""
+    wanted = f" {normalise(words)} "
+    for part in [*map(" ".join, split_clauses(text)), text]:
+        before, found, _ = f" {normalise(part)} ".partition(wanted)
+        if found:
+            return not (NEGATIONS | _REPLACED) & set(before.split())
+    return False
+
+
 def find_states(text: str) -> list[Concept]:
     """Return the states that a text affirms, in order, else the opposites of those it denies: "not open" is closed."""
     affirmed = find_concepts(text, ["state"])
@@ -136,8 +151,10 @@ def read_counts(text: str) -> list[int]:
     if any(word in _PAIRS for word in words):
         return [2]
     if any(word in NEGATIONS for word in words):
-        return [0]
+        return [0] if "none" in words or not _UNCOUNTED & set(words) else []
     named = raw[2:] if raw[:2] in _LEADS else raw
+    if _AMOUNTS & set(named[1:3]):
+        return []
     return [1] if (len(named) > 1 and named[0] in ARTICLES - {"the"}) or {"single", "once"} & set(words) else []
 
 

@@ -21,11 +21,11 @@ from typing import Any
 
 from wiw.errors import JudgeError
 from wiw.judging.judge import HIGHEST_MARK, LOWEST_MARK, Judge, Judgement, Reference
-from wiw.judging.normalise import find_concepts, find_states, normalise, read_counts, read_polarity
+from wiw.judging.normalise import affirms_words, find_concepts, find_states, normalise, read_counts, read_polarity
 from wiw.judging.places import mark_place, names_place
 from wiw.judging.vocabulary import Concept, Kind, Relation, load_vocabulary
 
-RULES_VERSION = 2
+RULES_VERSION = 3
 """Raised when an answer may get another mark than before, beside changes of the vocabulary."""
 OFF_BY_ONE_MARK = 2
 COLOR_MARKS = {Relation.SAME: 5, Relation.BROADER: 4, Relation.NEAR: 3}
@@ -128,8 +128,7 @@ def _mark_named(kind: Kind, right: str, answer: str) -> int:
     """Return the mark of concepts of a kind; of words that no concept has, whether the answer says them."""
     known = find_concepts(right, [kind])
     if not known:
-        words, wanted = f" {normalise(answer)} ", f" {normalise(right)} "
-        return HIGHEST_MARK if wanted in words and " not " not in words else LOWEST_MARK
+        return HIGHEST_MARK if affirms_words(answer, right) else LOWEST_MARK
     return _mark_concepts(known, find_concepts(answer, [kind]), OBJECT_MARKS) or LOWEST_MARK
 
 

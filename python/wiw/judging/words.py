@@ -13,6 +13,8 @@ _UNITS = (
 )  # fmt: skip
 _TENS = {"twenty": 20, "thirty": 30, "forty": 40, "fifty": 50, "sixty": 60, "seventy": 70, "eighty": 80, "ninety": 90}
 NUMBERS = {word: value for value, word in enumerate(_UNITS)} | _TENS | {"dozen": 12}
+_MULTIPLES = {"dozen": 12, "hundred": 100, "thousand": 1000}
+"""Words that multiply a number, or "a", before them."""
 IRREGULAR_PLURALS = {
     "children": "child", "people": "person", "men": "man", "women": "woman", "feet": "foot", "teeth": "tooth",
     "mice": "mouse", "geese": "goose", "knives": "knife", "shelves": "shelf", "bookshelves": "bookshelf",
@@ -36,6 +38,7 @@ _CONTRACTIONS = (
     (r"s'(?=\W|$)", "s"),
 )
 _WORD = re.compile(r"\d+(?:\.\d+)?|[^\W\d_]+")
+_THOUSANDS = re.compile(r"(?<=\d),(?=\d{3}(?!\d))")
 _LAST_PERIOD = re.compile(r"\.(?!\d)")
 
 
@@ -53,7 +56,7 @@ def unify_characters(text: str) -> str:
     text = unicodedata.normalize("NFKC", text).casefold().replace("\u2019", "'").replace("\u2018", "'")
     for pattern, instead in _CONTRACTIONS:
         text = re.sub(pattern, instead, text)
-    return text
+    return _THOUSANDS.sub("", text)
 
 
 def split_raw_words(text: str) -> list[str]:
@@ -73,12 +76,14 @@ def split_clauses(text: str) -> list[list[str]]:
 
 
 def merge_numbers(words: list[str]) -> list[str]:
-    """Return words with number words as digits: "twenty", "one" becomes "21"."""
+    """Return words with number words as digits: "twenty", "one" becomes "21", and "two", "dozen" becomes "24"."""
     merged: list[str] = []
     tens = 0
     for word in words:
         value = NUMBERS.get(word)
-        if tens and value is not None and 0 < value < 10:
+        if word in _MULTIPLES and merged and (merged[-1].isdecimal() or merged[-1] == "a"):
+            merged[-1] = str(_MULTIPLES[word] * (1 if merged[-1] == "a" else int(merged[-1])))
+        elif tens and value is not None and 0 < value < 10:
             merged[-1] = str(tens + value)
         else:
             merged.append(word if value is None else str(value))

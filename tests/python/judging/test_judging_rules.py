@@ -71,6 +71,21 @@ PAIRS = [  # type, question, right answer, answer, mark
     ("count", COUNT, "4", "several", 1),
     ("count", COUNT, "4", "4 or 5 or 6", 2),
     ("count", COUNT, "0", "none", 5),
+    ("count", COUNT, "0", "none that I know of", 5),
+    ("count", COUNT, "0", "I'm not sure", 1),
+    ("count", COUNT, "0", "I cannot tell", 1),
+    ("count", COUNT, "0", "no idea", 1),
+    ("count", COUNT, "0", "not many", 1),
+    ("count", COUNT, "1", "a few chairs", 1),
+    ("count", COUNT, "1", "there is a small number of chairs", 1),
+    ("count", COUNT, "24", "two dozen", 5),
+    ("count", COUNT, "100", "a hundred", 5),
+    ("count", COUNT, "1200", "1,200 chairs", 5),
+    ("category", WHAT, "theremin", "a theremin", 5),
+    ("category", WHAT, "theremin", "There is no theremin", 1),
+    ("category", WHAT, "theremin", "never a theremin", 1),
+    ("category", WHAT, "theremin", "not a piano, a theremin", 5),
+    ("category", WHAT, "theremin", "a piano", 1),
     ("count", COUNT, "0", "there are no chairs", 5),
     ("count", COUNT, "1", "there are no chairs", 2),
     ("count", COUNT, "1", "a chair", 5),
@@ -361,5 +376,5 @@ def test_judgements_and_judges_describe_themselves_as_json() -> None:
     assert Judgement.from_info(json.loads(json.dumps(judgement.to_info()))) == judgement
     rules, both = RuleJudge().describe(), make_judge("rules").describe()
     assert json.loads(json.dumps(both)) == both and both["tiers"][0] == rules
-    assert rules["version"] == 2 and rules["vocabulary"] == load_vocabulary().digest
+    assert rules["version"] == 3 and rules["vocabulary"] == load_vocabulary().digest
     assert make_judge("approximate").describe() != both
