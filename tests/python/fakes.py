@@ -6,11 +6,12 @@ The agent draws each plan from the decision's key, so a run's results are a func
 
 from __future__ import annotations
 
+import math
 import os
 import signal
 import threading
 import time
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -110,6 +111,18 @@ class LineTask(Task):
             Episode(f"{i:04d}", f"line/{i // 2}", (0.0, 0.0, 0.0), 0.0, (float(d), 0.0, 0.0), 0.0, float(d))
             for i, d in enumerate(lengths)
         ]
+
+
+@dataclass
+class PictureTask(LineTask):
+    """Goals whose place is not known, as in lists of questions; their pictures lie in a folder."""
+
+    folder: str = "/data"
+
+    def episodes(self, count: int) -> list[Episode]:
+        unknown: dict[str, Any] = {"goal_position": (math.nan,) * 3}
+        info = {"goal_image": f"{self.folder}/goals/0.png"}
+        return [replace(each, **unknown, info=info) for each in super().episodes(count)]
 
 
 @dataclass

@@ -70,12 +70,11 @@ def frame_of_points(points: NDArray[np.float64]) -> MapFrame:
     return MapFrame(width, height, np.array([[PIXELS_PER_METRE, 0, shift[0]], [0, PIXELS_PER_METRE, shift[1]]]))
 
 
-def start_and_goal(frame: MapFrame, episode: Episode) -> tuple[Mark, Mark]:
-    """Return the start, and the place where the goal image was taken."""
-    return (
-        _mark(frame, episode.start_position, episode.start_yaw),
-        _mark(frame, episode.goal_position, episode.goal_yaw),
-    )
+def start_and_goal(frame: MapFrame, episode: Episode) -> tuple[Mark, Mark | None]:
+    """Return the start, and the place where the goal image was taken; None for a goal whose place is not known."""
+    is_known = bool(np.isfinite([*episode.goal_position, episode.goal_yaw]).all())
+    goal = _mark(frame, episode.goal_position, episode.goal_yaw) if is_known else None
+    return _mark(frame, episode.start_position, episode.start_yaw), goal
 
 
 def trail(frame: MapFrame, arm: str, decisions: Sequence[Mapping[str, Any]]) -> Trail:
@@ -89,9 +88,10 @@ def trail(frame: MapFrame, arm: str, decisions: Sequence[Mapping[str, Any]]) -> 
 
 
 def all_points(episode: Episode, decisions: Sequence[Mapping[str, Any]]) -> NDArray[np.float64]:
-    """Return every world point that an episode touches, float64 [N, 3]."""
+    """Return every world point that an episode touches, as far as they are known, float64 [N, 3]."""
     ends = np.array([episode.start_position, episode.goal_position], np.float64)
-    return np.concatenate([ends, *(np.asarray(decision["path"], np.float64) for decision in decisions)])
+    points = np.concatenate([ends, *(np.asarray(decision["path"], np.float64) for decision in decisions)])
+    return points[np.isfinite(points).all(axis=1)]
 
 
 def _place(decision: Mapping[str, Any], when: str) -> tuple[float, float, float]:

@@ -152,7 +152,7 @@ def _list_tiers(summary: Summary) -> list[dict[str, Any]]:
 def sentence(summary: Summary, words: Wording | None = None) -> str:
     """Return the result in a few sentences that claim no more than the adjusted tests support."""
     judged = [line for line in summary.arms if "success" in line.estimates and line.name != "none"]
-    shown = [line for line in judged if line.role == "world model"] or judged[-1:]
+    shown = [line for line in judged if line.role == "world model"]
     parts = []
     for line in shown[:3]:
         share = line.estimates["success"].value

@@ -195,7 +195,7 @@ class Story:
     """Id of the scene's map among the page's shared pictures."""
     frame: MapFrame | None
     """None if plans are of poses: the way is drawn on what the camera sees."""
-    ends: tuple[Mark, Mark] | None
+    ends: tuple[Mark, Mark | None] | None
     """Start and goal on the map."""
     attempts: tuple[Attempt, ...]
     words: Wording

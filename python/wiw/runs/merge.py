@@ -7,6 +7,7 @@ and `calls` as far as they depend on which episodes ran together, and what `info
 
 from __future__ import annotations
 
+import math
 import shutil
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import ExitStack, contextmanager
@@ -218,8 +219,13 @@ def _compare(first: Any, second: Any, place: str) -> Iterator[tuple[str, Any, An
     elif isinstance(first, list | tuple) and isinstance(second, list | tuple) and len(first) == len(second):
         for index, (one, other) in enumerate(zip(first, second, strict=True)):
             yield from _compare(one, other, f"{place}[{index}]")
-    elif first != second:
+    elif first != second and not _are_unknown(first, second):
         yield place, first, second
+
+
+def _are_unknown(*values: Any) -> bool:
+    """Return whether all values are NaN, such as the place of a goal that nobody knows."""
+    return all(isinstance(each, float) and math.isnan(each) for each in values)
 
 
 def _show(value: Any, most: int = 120) -> str:

@@ -5,6 +5,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping, Sequence
+from contextlib import ExitStack, closing
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -95,7 +96,14 @@ def compare(
         StoreError: a run cannot be read, or the two differ in task, seed, episodes or judge: the first field that
             differs.
     """
-    first, second = (_open(run, judge) for run in (a, b))
+    with ExitStack() as stack:
+        first, second = (_open(run, judge, stack) for run in (a, b))
+        return _compare_logs(first, second, arm, other, unlike_budgets)
+
+
+def _compare_logs(
+    first: RunLog, second: RunLog, arm: str | None, other: str | None, unlike_budgets: bool
+) -> Comparison:
     pairs = _list_pairs(first, second, arm, other)
     require_comparable(first, second, pairs, unlike_budgets)
     differing = list_unlike_budgets(first, second, pairs)
@@ -147,11 +155,11 @@ def compare(
     )
 
 
-def _open(run: str | Path | RunLog, judge: str | None) -> RunLog:
-    """Return a run with the marks of a judge."""
-    if isinstance(run, RunLog):
-        return run if judge is None else load_run(run.path, judge)
-    return load_run(run, judge)
+def _open(run: str | Path | RunLog, judge: str | None, stack: ExitStack) -> RunLog:
+    """Return a run with the marks of a judge; what is opened for it is closed with the stack."""
+    if isinstance(run, RunLog) and judge is None:
+        return run
+    return stack.enter_context(closing(load_run(run.path if isinstance(run, RunLog) else run, judge)))
 
 
 def _summarise_arms(log: RunLog, both: Summary, labels: Mapping[str, str]) -> list[ArmSummary]:
@@ -271,6 +279,12 @@ def _require_same_episode(a: RunLog, b: RunLog, index: int, pair: tuple[Episode,
 
 def _simplify_value(value: Any) -> Any:
     """Return a value as it is compared: a path by its last part, as scenes lie elsewhere on another machine."""
+    if isinstance(value, Mapping):
+        return {name: _simplify_value(each) for name, each in value.items()}
+    if isinstance(value, list | tuple):
+        return [_simplify_value(each) for each in value]
+    if isinstance(value, float) and math.isnan(value):  # an unknown goal is equal to another one
+        return None
     if isinstance(value, str) and "/" in value and Path(value).is_absolute():
         return Path(value).name
     return value

@@ -3,11 +3,12 @@ import json
 import re
 import sqlite3
 from contextlib import closing
+from dataclasses import replace
 from html.parser import HTMLParser
 
 import numpy as np
 import pytest
-from fakes import LineAgent, LineTask
+from fakes import LineAgent, LineTask, PictureTask
 from matplotlib.axes import Axes
 
 from wiw.analysis.intervals import wilson
@@ -96,6 +97,21 @@ def test_the_page_shows_every_arm_decision_and_failure(log, page):
     assert sum("chosen" in name for name in classes) == steps
     assert "no such scene" in text and "reference, the true future" in text and "floor, predicts" in text
     assert f"{log.numbers()['warp'].estimates['success'].value:.1f}" in text
+
+
+def test_a_goal_whose_place_is_not_known_is_not_drawn(tmp_path):
+    log = run_arms(PictureTask(), {"none": LineAgent()}, 2, out=tmp_path / "run", progress=False)
+    log.report(tmp_path / "report" / "page.html")
+    log.view(tmp_path / "view")
+    for folder in ("report", "view"):
+        text = "".join(page.read_text() for page in (tmp_path / folder).rglob("*.html"))
+        assert "<polyline" in text and 'class="start"' in text and 'class="goal"' not in text
+        assert not re.search(r"""["' ,(]nan["' ,)]""", text)
+
+
+def test_the_headline_is_of_world_models_alone(log):
+    lines = [line for line in log.numbers().arms if line.name in ("none", "copy", "oracle")]
+    assert sentence(replace(log.numbers(), arms=tuple(lines))) == ""
 
 
 def test_a_task_that_says_nothing_of_itself_is_spoken_of_plainly(page):

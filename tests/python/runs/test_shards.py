@@ -14,6 +14,7 @@ from contextlib import closing
 from pathlib import Path
 
 import pytest
+from fakes import LineAgent, PictureTask
 from locations import PYTHON_TESTS
 
 import wiw
@@ -28,7 +29,7 @@ from wiw.runs.run import list_marks
 from wiw.runs.shards import Shard
 from wiw.runs.store import RunStore
 from wiw.runs.store_file import store_path
-from wiw.studies.evaluate import evaluate, resume_run
+from wiw.studies.evaluate import evaluate, resume_run, run_arms
 from wiw.studies.run_log import load_run
 from wiw.vlm.cache import ReplyCache
 from wiw.vlm.messages import Completion
@@ -102,6 +103,14 @@ def test_merged_shards_equal_the_run_of_one_process(tmp_path):
     assert one.table() == other.table() and one.complete and one.store.shard is None
     assert one.store.created == min(each["created"] for each in one.store.info["merged"])
     assert [each["shard"] for each in one.store.info["merged"]] == ["1/3", "2/3", "3/3"]
+
+
+def test_shards_of_episodes_whose_goal_is_not_known_are_merged(tmp_path):
+    shards = []
+    for shard in ("1/2", "2/2"):
+        shards.append(tmp_path / shard[0])
+        run_arms(PictureTask(), {"a": LineAgent()}, 4, out=shards[-1], shard=shard, salt="", progress=False)
+    assert wiw.merge(shards, tmp_path / "merged").complete
 
 
 def test_a_merged_run_is_of_the_version_that_ran_its_parts(tmp_path):

@@ -1,11 +1,13 @@
 # SPDX-License-Identifier: Apache-2.0
+import gc
 import io
 import shutil
 import sqlite3
 from dataclasses import dataclass, replace
+from pathlib import Path
 
 import pytest
-from fakes import LineAgent, LineTask
+from fakes import LineAgent, LineTask, PictureTask
 from rich.console import Console
 
 import wiw
@@ -167,6 +169,31 @@ def test_scenes_may_lie_elsewhere(runs, tmp_path):
         with sqlite3.connect(copy / "run.sqlite") as store:
             store.execute("UPDATE episode SET scene = ?", (f"{folder}/house.glb",))
     assert wiw.compare(*copies).difference("warp · there", "warp · here").estimate.n == 4
+
+
+def test_goals_may_be_unknown_and_their_pictures_lie_elsewhere(tmp_path):
+    copies = [tmp_path / name for name in ("here", "there")]
+    for copy, folder in zip(copies, ("/data", "/home/me/data"), strict=True):
+        run_arms(PictureTask(folder=folder), {"warp": LineAgent(0.5)}, 4, out=copy, progress=False)
+    assert wiw.compare(*copies).difference("warp · there", "warp · here").estimate.n == 4
+
+
+def test_runs_that_it_opens_are_closed(runs):
+    def count() -> int:
+        found = [each for each in Path("/proc/self/fd").iterdir() if each.is_symlink()]
+        return sum("run.sqlite" in str(each.readlink()) for each in found)
+
+    gc.collect()
+    gc.disable()
+    try:
+        before = count()
+        wiw.compare(*runs)
+        assert count() == before
+        with pytest.raises(ArgumentError):
+            wiw.compare(*runs, arm="nobody")
+        assert count() == before
+    finally:
+        gc.enable()
 
 
 def test_infrastructure_errors_leave_their_pair_out(runs, tmp_path):
