@@ -163,7 +163,7 @@ def summarise_errors(
     done, _ = split_outcomes(names, [row for row in outcomes if row["arm"] in names])
     measured = _average_by_episode(decisions)
     _add_regret(done, measured)
-    shown = [arm for arm in arms if done[arm] and done[CEILING]]
+    shown = [arm for arm in arms if done[arm].keys() & done[CEILING].keys()]
     pooled_arms = _choose_pooled(shown, done)
     scored = set.intersection(*(set(done[arm]) for arm in (FLOOR, CEILING, *pooled_arms)))
     metric = next(
@@ -171,7 +171,7 @@ def summarise_errors(
         for metric in (ANSWER_SCORE, SUCCESS)
         if all(metric.name in row["metrics"] for own in done.values() for row in own.values())
     )
-    hidden = [arm for arm in others if done[arm] and done[CEILING]]
+    hidden = [arm for arm in others if done[arm].keys() & done[CEILING].keys()]
     lines = _adjust(
         [_summarise_arm(arm, *arms[arm], done, measured, metric, seed) for arm in shown],
         [compare(arm, CEILING, done, metric, seed) for arm in hidden],

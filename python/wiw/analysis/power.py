@@ -6,7 +6,7 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass
 from functools import cache
-from numbers import Real
+from numbers import Integral, Real
 from typing import Any
 
 import numpy as np
@@ -21,6 +21,7 @@ BASE, LOSSES, CORRELATION, PER_SCENE = 20.0, 2.0, 0.05, 5
 """Close to what was measured on 210 test episodes of Image-Goal Navigation in 42 apartments (`docs/results.md`): 19 %
 succeed without a world model; the oracle wins 73 more and loses 3; paired differences correlate within apartments by
 -0.06 to 0.06."""
+WHOLE = ("scenes", "per_scene", "arms", "seed")
 MOST_SCENES = 100_000
 LEAST = 0.1
 """Step of the search for a difference, in points."""
@@ -129,8 +130,11 @@ def power(
     numbers = {"difference": difference, "scenes": scenes, "base": base, "losses": losses, "correlation": correlation}
     numbers |= {"per_scene": per_scene, "chance": chance, "arms": arms, "seed": seed}
     for name, value in numbers.items():
-        if value is not None and (isinstance(value, bool) or not isinstance(value, Real)):
-            raise ArgumentError(f"power: {name}: expected a number, got {value!r}")
+        kind, noun = (Integral, "a whole number") if name in WHOLE else (Real, "a finite number")
+        if value is not None and (isinstance(value, bool) or not isinstance(value, kind) or not math.isfinite(value)):
+            raise ArgumentError(f"power: {name}: expected {noun}, got {value!r}")
+    if seed < 0:
+        raise ArgumentError(f"power: seed: expected at least 0, got {seed}")
     if (difference is None) == (scenes is None):
         raise ArgumentError(
             "power: expected either a difference (to compute the scenes it needs) or a number of scenes (to compute "

@@ -9,7 +9,7 @@ import warnings
 from collections import Counter
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
-from functools import cache, reduce
+from functools import cache
 from typing import Any
 
 from wiw.analysis.breakdowns import (
@@ -466,6 +466,7 @@ def split_outcomes(
 ) -> tuple[dict[str, dict[int, Mapping[str, Any]]], dict[str, int]]:
     """Return by arm the scored episodes, by index and with all metrics, and the number of errors.
 
+    Where a task measured nothing, None or NaN, the episode has no value of that metric.
     An edited copy of an apartment counts as the same scene: intervals are over apartments.
     """
     known = load_metrics()
@@ -473,12 +474,20 @@ def split_outcomes(
     errors = dict.fromkeys(arms, 0)
     for outcome in outcomes:
         if outcome["status"] == "done":
-            metrics = reduce(lambda values, metric: metric.add_to(values), known, outcome["metrics"])
+            metrics: Mapping[str, float] = {
+                name: value for name, value in outcome["metrics"].items() if _is_measured(value)
+            }
+            for metric in known:
+                metrics = metric.add_to(metrics)
             scene = strip_edits(outcome["scene"])
             done[outcome["arm"]][outcome["episode"]] = {**outcome, "scene": scene, "metrics": metrics}
         else:
             errors[outcome["arm"]] += 1
     return done, errors
+
+
+def _is_measured(value: Any) -> bool:
+    return value is not None and not math.isnan(value)
 
 
 def find_cause(arm: str, outcomes: Sequence[Mapping[str, Any]]) -> str:

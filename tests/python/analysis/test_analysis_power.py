@@ -166,9 +166,21 @@ def test_the_correlation_of_a_pilot_is_that_of_its_scenes():
 
 
 @pytest.mark.usefixtures("fewer_runs")
-@pytest.mark.parametrize("given", [{"difference": "10"}, {"difference": [10]}, {"difference": 10, "base": "20"}])
-def test_what_is_no_number_is_refused(given):
-    with pytest.raises(ArgumentError, match=r"power: (difference|base): expected a number, got"):
+@pytest.mark.parametrize(
+    "given",
+    [
+        {"difference": "10"},
+        {"difference": [10]},
+        {"difference": float("nan")},
+        {"difference": 10, "base": "20"},
+        {"difference": 10, "per_scene": 2.5},
+        {"difference": 10, "arms": 1.5},
+        {"difference": 10, "seed": -1},
+        {"scenes": 10.5},
+    ],
+)
+def test_what_is_no_such_number_is_refused(given):
+    with pytest.raises(ArgumentError, match=r"power: \w+: expected (a finite number|a whole number|at least 0), got"):
         wiw.power(**given)
 
 

@@ -232,6 +232,12 @@ def test_unfinished_arms_are_shown_but_not_counted_among_the_costs() -> None:
     assert found.episodes == EPISODES and {cost.family for cost in found.costs} == {"looks"}
 
 
+def test_an_arm_without_an_episode_of_the_oracle_is_not_shown_yet() -> None:
+    rows = [row for row in outcomes() if (row["episode"] == 0) != (row["arm"] == "error-lag@4") and row["episode"] < 2]
+    found = summarise_errors("imagenav", "matcher", rows, decisions(), ARMS)
+    assert [line.arm for line in found.lines] == ["error-blur@64", "error-lag@2"]
+
+
 def test_a_single_episode_has_no_interval_of_regret() -> None:
     first = [row for row in outcomes() if row["episode"] == 0]
     found = summarise_errors("imagenav", "matcher", first, decisions(), ARMS)
