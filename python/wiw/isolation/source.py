@@ -81,7 +81,8 @@ class Source:
             InfrastructureError: it has changed since it was first imported.
         """
         found = self._import(process, seconds)
-        if any(found[each] != self.description[each] for each in ("module", "name", "sources")):
+        version = "sources" if found["sources"] else "module"  # the latter also changes with the time of a file
+        if any(found[each] != self.description[each] for each in ("name", version)):
             raise InfrastructureError(f"{self.kind} '{self.name}' has changed since it was loaded; start a new run")
 
     def _import(self, process: ChildProcess, seconds: float) -> dict[str, Any]:

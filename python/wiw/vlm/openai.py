@@ -207,7 +207,7 @@ class OpenAIClient(Client):
         hosted = None if self._servers.are_announced else os.environ.get("OPENAI_API_KEY")
         key = server.token or hosted or "none"
         direct = self._servers.are_announced or is_loopback(urlsplit(server.address).hostname or "")
-        routes = {"mounts": dict(NO_PROXY)} if direct else {}
+        routes: dict[str, Any] = {"mounts": dict(NO_PROXY)} if direct else {}
         http = openai.DefaultHttpxClient(event_hooks={"response": [self._cut_off]}, **routes)
         sdk = openai.OpenAI(base_url=server.address, api_key=key, timeout=self.timeout, max_retries=0, http_client=http)
         if sdk.base_url.host != OPENAI_HOST:  # what the SDK reads from the environment is no business of others
