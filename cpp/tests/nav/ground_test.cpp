@@ -62,6 +62,24 @@ TEST_CASE("a strip that is long beyond measure takes no more memory than a floor
   CHECK(nav::Ground(soup).height({5, 0.1, 0.0005}) == 0);
 }
 
+TEST_CASE("slivers take memory by their area, and no point falls between them") {
+  scene::TriangleSoup soup;
+  constexpr std::uint32_t kCorners = 4096;
+  constexpr double kRadius = 250, kSlope = 0.1;
+  for (std::uint32_t i = 0; i < kCorners; ++i) {
+    const double angle = 2 * EIGEN_PI * i / kCorners, x = kRadius * std::cos(angle), z = kRadius * std::sin(angle);
+    soup.vertices.emplace_back(float(x), float(kSlope * x), float(z));
+    if (i >= 2) soup.triangles.push_back({0, i, i - 1});  // a fan, whose triangles are as long as the disc
+  }
+  const nav::Ground ground(soup);  // with each triangle in all cells around it: 10 GB
+  std::mt19937 random(7);
+  std::uniform_real_distribution<double> place(-170.0, 170.0);
+  for (int i = 0; i < 3000; ++i) {
+    const double x = place(random), z = place(random);
+    CHECK(ground.height({x, kSlope * x + 0.05, z}) == doctest::Approx(kSlope * x).epsilon(1e-4));
+  }
+}
+
 TEST_CASE("heights on a bumpy sheet are those of every triangle looked at") {
   std::mt19937 random(7);
   std::uniform_real_distribution<float> bump(0.f, 0.08f);

@@ -113,12 +113,10 @@ TEST_CASE("glTF accessors that are read side by side are as long as each other")
   refused({.primitive = R"({"attributes":{"POSITION":0},"indices":2})", .accessors = two}, "names indices 2 of 2");
   refused({.accessors = two, .more = R"(,"skins":[{"inverseBindMatrices":1,"joints":[0,0,0]}])"},
           "2 matrices for 3 joints");
-  const auto animated = [&](const std::string& sampler) {
-    return Gltf{.accessors = two, .more = R"(,"animations":[{"channels":[],"samplers":[)" + sampler + "]}]"};
-  };
-  CHECK_NOTHROW(check_layout(animated(R"({"input":1,"output":0})")));
-  refused(animated(R"({"input":0,"output":1})"), "2 values for 3 times");
-  refused(animated(R"({"input":1,"output":0,"interpolation":"CUBICSPLINE"})"), "3 values for 2 times");
+}
+
+TEST_CASE("damage in animations, which are not read, does not matter") {
+  CHECK_NOTHROW(check_layout(Gltf{.more = R"(,"animations":[{"channels":[],"samplers":[{"input":7,"output":9}]}])"}));
 }
 
 TEST_CASE("glTF files with accessors beyond their views are refused before they are read") {

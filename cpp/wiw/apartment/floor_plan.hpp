@@ -75,10 +75,6 @@ FloorPlan make_layout(std::uint64_t seed, Split split);
 /// Adds doors, arches, the entrance and windows such that one can walk from door to door in every empty room.
 void add_openings(FloorPlan& plan, std::uint64_t seed);
 
-/// Room on the far side, or kOutside.
-inline std::int32_t other_room(const Opening& opening, std::int32_t room) {
-  return opening.room_a == room ? opening.room_b : opening.room_a;
-}
 /// Side of `room` (one of the two) on which the opening lies.
 inline Side side_in(const Opening& opening, std::int32_t room) {
   return opening.room_a == room ? opening.side : opposite(opening.side);

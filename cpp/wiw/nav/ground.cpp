@@ -3,6 +3,7 @@
 
 #include <algorithm>
 #include <cmath>
+#include <limits>
 #include <numeric>
 #include <optional>
 
@@ -25,6 +26,28 @@ std::optional<double> height_at(const Eigen::Matrix3f& corners, double x, double
   constexpr double kMargin = 1e-6;  // so that no seam lets the agent fall through
   if (!(s >= -kMargin && t >= -kMargin && s + t <= 1 + kMargin)) return std::nullopt;
   return corners(1, 0) + s * (corners(1, 1) - corners(1, 0)) + t * (corners(1, 2) - corners(1, 0));
+}
+
+struct StripRange {
+  double low = std::numeric_limits<double>::infinity(), high = -std::numeric_limits<double>::infinity();
+
+  void add(double value) {
+    low = std::min(low, value);
+    high = std::max(high, value);
+  }
+};
+
+/// The range of x of the triangle where its z lies in a strip; empty (low above high) where it does not reach that.
+StripRange range_in_strip(const Eigen::Matrix3f& corners, double from, double to) {
+  StripRange range;
+  for (int k = 0; k < 3; ++k) {
+    const Eigen::Vector2d a(corners(0, k), corners(2, k)), b(corners(0, (k + 1) % 3), corners(2, (k + 1) % 3));
+    if (from <= a.y() && a.y() <= to) range.add(a.x());
+    for (const double edge : {from, to}) {
+      if ((a.y() < edge) != (b.y() < edge)) range.add(a.x() + (edge - a.y()) / (b.y() - a.y()) * (b.x() - a.x()));
+    }
+  }
+  return range;
 }
 
 bool level(const Eigen::Matrix3f& corners) {
@@ -54,16 +77,21 @@ Ground::Ground(const scene::TriangleSoup& soup) {
   first_.assign(static_cast<std::size_t>(cells_.prod()) + 1, 0);
   const auto for_cells = [this](const TriangleCorners& corners, auto&& visit) {
     const Eigen::Vector3f low = corners.rowwise().minCoeff(), high = corners.rowwise().maxCoeff();
-    const Eigen::Vector2i from = cell_of(low.x(), low.z()), to = cell_of(high.x(), high.z());
-    for (int row = from.y(); row <= to.y(); ++row) {
-      for (int column = from.x(); column <= to.x(); ++column) visit(slot(column, row));
+    // Wider than by what `height_at` allows beyond the edges, and by rounding.
+    const double margin = 1e-4 * cell_ + 1e-5 * static_cast<double>((high - low).maxCoeff());
+    for (int row = cell_of(0, low.z()).y(), last = cell_of(0, high.z()).y(); row <= last; ++row) {
+      const double begin = static_cast<double>(origin_.y()) + row * cell_;
+      const StripRange range = range_in_strip(corners, begin - margin, begin + cell_ + margin);
+      if (range.low > range.high) continue;
+      const int to = cell_of(range.high + margin, 0).x();
+      for (int column = cell_of(range.low - margin, 0).x(); column <= to; ++column) visit(slot(column, row));
     }
   };
   for (const TriangleCorners& corners : triangles_)
     for_cells(corners, [this](std::size_t cell) { ++first_[cell + 1]; });
   std::partial_sum(first_.begin(), first_.end(), first_.begin());
   entries_.resize(first_.back());
-  std::vector<std::uint32_t> next(first_.begin(), first_.end() - 1);
+  std::vector<std::size_t> next(first_.begin(), first_.end() - 1);
   for (std::uint32_t i = 0; i < triangles_.size(); ++i) {
     for_cells(triangles_[i], [&](std::size_t cell) { entries_[next[cell]++] = i; });
   }
@@ -74,7 +102,7 @@ double Ground::height(const Eigen::Vector3d& point) const {
   const Eigen::Vector2i cell = cell_of(point.x(), point.z());
   const std::size_t at = slot(cell.x(), cell.y());
   std::optional<double> best;
-  for (std::uint32_t i = first_[at]; i < first_[at + 1]; ++i) {
+  for (std::size_t i = first_[at]; i < first_[at + 1]; ++i) {
     const auto height = height_at(triangles_[entries_[i]], point.x(), point.z());
     if (!height || *height < point.y() - kBelow || *height > point.y() + kAbove) continue;
     best = std::max(*height, best.value_or(*height));

@@ -34,7 +34,7 @@ class Ground {
   Eigen::Vector2f origin_ = Eigen::Vector2f::Zero();  // least x and z
   double cell_ = 0.25;                                // metres
   Eigen::Vector2i cells_ = Eigen::Vector2i::Zero();
-  std::vector<std::uint32_t> first_;    // per cell, and one more: where its entries begin
+  std::vector<std::size_t> first_;      // per cell, and one more: where its entries begin
   std::vector<std::uint32_t> entries_;  // indices of triangles
 };
 

@@ -186,7 +186,6 @@ World::~World() = default;
 const WorldOptions& World::options() const { return impl_->options; }
 double World::time() const { return static_cast<double>(impl_->steps) * impl_->options.time_step; }
 int World::body_count() const { return static_cast<int>(impl_->bodies.size()); }
-int World::articulation_count() const { return static_cast<int>(impl_->arms.size()); }
 const Body& World::body(int body) const { return impl_->body(body).model().body; }
 const ArticulationPtr& World::articulation(int articulation) const {
   return impl_->arm(articulation).model()->articulation;

@@ -101,7 +101,6 @@ class World {
   /// Index of the articulation, from 0; its joints start at the positions nearest to zero that the limits allow.
   int add_articulation(ArticulationPtr articulation, const Pose& T_world_base = Pose::Identity());
   [[nodiscard]] int body_count() const;
-  [[nodiscard]] int articulation_count() const;
   [[nodiscard]] const Body& body(int body) const;
   [[nodiscard]] const ArticulationPtr& articulation(int articulation) const;
   [[nodiscard]] const Pose& base_pose(int articulation) const;

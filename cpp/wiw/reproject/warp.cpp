@@ -85,7 +85,8 @@ bool saw_sky(std::uint32_t texel, std::uint32_t fraction14, const float* depth, 
   const std::uint32_t column = (texel & 0xFFFFu) + ((fraction14 & 0xFFFFu) >= half ? 1 : 0);
   const std::uint32_t row = (texel >> 16) + ((fraction14 >> 16) >= half ? 1 : 0);
   const auto width = static_cast<std::uint32_t>(size.width);
-  return !(depth[static_cast<std::size_t>(row) * width + (column < width ? column : 0)] > 0.0F);
+  const float seen = depth[static_cast<std::size_t>(row) * width + (column < width ? column : 0)];
+  return !(seen > 0.0F && seen < kFar);
 }
 
 View checked(const View& view, const char* name) {

@@ -146,10 +146,11 @@ def test_what_a_pillar_hid_is_filled_from_behind_it():
     assert psnr(out["color"][0, 0], true_color) > psnr(copied, true_color) + 12
 
 
-def test_sky_stays_where_it_is_and_keeps_depth_zero():
+@pytest.mark.parametrize("nothing", [0.0, -1.0, np.nan, np.inf, 2e4])
+def test_sky_stays_where_it_is_and_keeps_depth_zero(nothing):
     color, depth = picture(sphere())
     sky = sphere()[..., 1] > 0.5
-    depth[sky] = 0
+    depth[sky] = nothing
     color[sky] = (10, 200, 30)
     out = reproject.warp(color[None], depth[None], POSES["forward"][None, None], outputs=("color", "depth"))
     high = sphere()[..., 1] > 0.9
