@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from wiw import panorama
 from wiw.policies.base import Situation
 from wiw.policies.matcher import appearance
-from wiw.policies.matcher.exploration import CELL, FAR_DISTANCE, HALF, compute_distance_field, to_cells
+from wiw.policies.matcher.exploration import FAR_DISTANCE, compute_distance_field
 from wiw.policies.matcher.policy import HEADINGS, Matcher, Memory
 from wiw.types import Goal, Key, Observation
 
@@ -86,13 +86,13 @@ class Geometric(Matcher):
 def _measure_distances(memory: GeometricMemory, place: NDArray[np.float64]) -> NDArray[np.float64]:
     """Return the metres to the place through free cells; straight-line metres where no path is known."""
     free = memory.map.find_free_cells()
-    free[to_cells(memory.map.trail[-1][:1], memory.map.trail[-1][1:])] = True
+    free[memory.map.to_cells(memory.map.trail[-1][:1], memory.map.trail[-1][1:])] = True
     source = np.zeros_like(free)
-    row, column = to_cells(place[:1], place[1:])
+    row, column = memory.map.to_cells(place[:1], place[1:])
     source[row, column] = True
     free |= source
     walked = compute_distance_field(free, source)
-    centres = (np.arange(2 * HALF) - HALF + 0.5) * CELL
+    centres = memory.map.centres
     straight = np.hypot(centres[:, None] - place[0], centres[None] - place[1])
     return np.where(walked < FAR_DISTANCE, walked, straight + 1.0)
 

@@ -16,7 +16,7 @@ from wiw.action import FORWARD, TURN_LEFT, TURN_RIGHT
 from wiw.errors import ArgumentError
 from wiw.policies.base import Situation
 from wiw.policies.heuristic import INVERSE
-from wiw.policies.matcher.exploration import CELL, FAR_DISTANCE, ExplorationMap, to_cells
+from wiw.policies.matcher.exploration import CELL, FAR_DISTANCE, ExplorationMap
 from wiw.policies.matcher.policy import (
     HEADINGS,
     STEP,
@@ -162,8 +162,8 @@ def test_the_map_knows_walls_free_space_and_the_frontier() -> None:
     exploration, depth = corridor()
     exploration.update(depth, np.zeros(3), np.zeros(128, np.float32))
     free = exploration.find_free_cells()
-    assert free[to_cells(np.array([-1.5, 0.0, 2.0]), np.zeros(3))].all()
-    assert not free[to_cells(np.zeros(2), np.array([-1.0, 1.0]))].any()
+    assert free[exploration.to_cells(np.array([-1.5, 0.0, 2.0]), np.zeros(3))].all()
+    assert not free[exploration.to_cells(np.zeros(2), np.array([-1.0, 1.0]))].any()
     runs, ends = exploration.look_ahead(np.zeros(3), 4, 2.5)
     assert runs[0] == 2.5
     assert 0.5 < runs[1] < 1.0
@@ -186,6 +186,31 @@ def test_the_target_is_the_frontier_that_looks_like_the_goal() -> None:
         distance = exploration.distance_to_target(4.0, 0.1)
         there, away = exploration.sample_grid(distance, np.array([[nearer, 0.0], [-nearer, 0.0]]))
         assert there < away
+
+
+def test_the_map_reaches_as_far_as_the_agent_gets() -> None:
+    """Along an endless corridor, and across it: the open end ahead stays the nearest frontier."""
+    _, depth = corridor()
+    depth = np.concatenate([depth[:, 32:96], depth[:, 32:96]], 1)  # open behind, too
+    depth = np.roll(depth, 32, 1)
+    for along in (np.array([1.0, 0.0]), np.array([0.0, -1.0])):
+        azimuth = np.arctan2(along[1], along[0])
+        exploration, found = ExplorationMap(), []
+        for metres in np.arange(0, 30.1, 0.6):
+            exploration.update(depth, np.array([*(metres * along), azimuth]), np.zeros(128, np.float32))
+            field = exploration.distance_to_target(4.0, 0.1)
+            found.append(exploration.sample_grid(field, np.array([metres * along, (metres + 1) * along])))
+        here, ahead = np.transpose(found)
+        assert np.all(np.abs(here - ahead - 1) < 0.11) and np.ptp(here[1:]) < 0.3
+        assert len(exploration.explored) == 2 * exploration.half == len(exploration.centres)
+
+
+def test_a_map_that_need_not_grow_is_as_it_was() -> None:
+    exploration, depth = corridor()
+    exploration.update(depth, np.array([11.4, -11.4, 0.3]), np.zeros(128, np.float32))
+    assert exploration.explored.shape == (320, 320)
+    exploration.update(depth, np.array([11.6, 0.0, 0.3]), np.zeros(128, np.float32))
+    assert exploration.explored.shape == (400, 400)
 
 
 def test_a_refused_step_makes_what_is_ahead_solid() -> None:

@@ -3,6 +3,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass, field
 from functools import cache
 
@@ -14,10 +15,12 @@ from scipy.sparse import csgraph
 
 CELL = 0.1
 """Metres."""
-HALF = 160
-"""Cells from the start to the map's edge."""
+HALF, GROWTH = 160, 40
+"""Cells from the start to the edge of the smallest map, and by which each side moves out at a time: 16 and 4 m."""
 RANGE = 4.0
 """Metres up to which depth marks space as explored."""
+MARGIN = 0.5
+"""Metres beyond these that the map reaches."""
 CAMERA_HEIGHT = 1.0
 OBSTACLE = (0.25, 1.5)
 """Heights above the floor, in metres, between which a surface blocks the agent."""
@@ -26,7 +29,7 @@ FAR_DISTANCE = 30.0
 
 @dataclass
 class ExplorationMap:
-    """A grid in the start frame: x forward (rows), y left (columns)."""
+    """A grid in the start frame: x forward (rows), y left (columns); it grows as the agent gets far from the start."""
 
     explored: NDArray[np.bool_] = field(default_factory=lambda: np.zeros((2 * HALF, 2 * HALF), bool))
     occupied: NDArray[np.uint8] = field(default_factory=lambda: np.zeros((2 * HALF, 2 * HALF), np.uint8))
@@ -35,10 +38,34 @@ class ExplorationMap:
     times: NDArray[np.float32] = field(default_factory=lambda: np.zeros((2 * HALF, 2 * HALF), np.float32))
     trail: list[NDArray[np.float64]] = field(default_factory=list)
 
+    @property
+    def half(self) -> int:
+        """Cells from the start to the map's edge."""
+        return len(self.explored) // 2
+
+    @property
+    def centres(self) -> NDArray[np.float64]:
+        """Middles of the cells along each axis in metres, float64 [2 * half]."""
+        return (np.arange(2 * self.half) - self.half + 0.5) * CELL
+
+    def to_cells(self, x: NDArray[np.float64], y: NDArray[np.float64]) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
+        """Convert positions in metres to row and column, clipped to the map."""
+        row, column = (np.floor(along / CELL).astype(np.intp) + self.half for along in (x, y))
+        return np.clip(row, 0, 2 * self.half - 1), np.clip(column, 0, 2 * self.half - 1)
+
+    def _grow_around(self, odometry: NDArray[np.float64]) -> None:
+        """Let the map reach as far as is seen from a place."""
+        needed = (np.abs(odometry[:2]).max() + RANGE + MARGIN) / CELL - self.half
+        if needed > 0:
+            more = GROWTH * math.ceil(needed / GROWTH)
+            self.explored, self.occupied = np.pad(self.explored, more), np.pad(self.occupied, more)
+            self.likeness, self.times = np.pad(self.likeness, more), np.pad(self.times, more)
+
     def update(self, depth: NDArray[np.float32], odometry: NDArray[np.float64], likeness: NDArray[np.float32]) -> None:
         """Add a panorama of distances float32 [H, W] at (x, y, azimuth); `likeness` [W] is the similarity of each
         column.
         """
+        self._grow_around(odometry)
         rays, height = _get_rays(depth.shape)
         azimuth = odometry[2] + rays["azimuth"]
         flat = depth * rays["cos_latitude"]
@@ -47,11 +74,11 @@ class ExplorationMap:
         solid = hit & (floor_height > OBSTACLE[0]) & (floor_height < OBSTACLE[1])
         x, y = odometry[0] + flat * np.cos(azimuth), odometry[1] + flat * np.sin(azimuth)
         ground = hit & (np.abs(floor_height) < 0.12)
-        self.explored[to_cells(x[ground], y[ground])] = True
+        self.explored[self.to_cells(x[ground], y[ground])] = True
         self._sweep(np.where(solid, flat, np.inf).min(0), azimuth, odometry, likeness)
-        self.occupied[to_cells(x[solid], y[solid])] = 1
+        self.occupied[self.to_cells(x[solid], y[solid])] = 1
         self.trail.append(np.array(odometry[:2]))
-        here = to_cells(np.array([odometry[0]]), np.array([odometry[1]]))
+        here = self.to_cells(np.array([odometry[0]]), np.array([odometry[1]]))
         self.explored[here] = True
 
     def _sweep(
@@ -65,7 +92,7 @@ class ExplorationMap:
         steps = np.arange(0.05, RANGE, CELL / 2)[:, None]
         inside = steps < np.minimum(reach, RANGE)[None] - CELL
         x, y = odometry[0] + steps * np.cos(azimuth), odometry[1] + steps * np.sin(azimuth)
-        here = to_cells(x[inside], y[inside])
+        here = self.to_cells(x[inside], y[inside])
         self.explored[here] = True
         self.times[here] += 1
         values = np.broadcast_to(likeness, inside.shape)[inside]
@@ -75,7 +102,7 @@ class ExplorationMap:
         """Mark the cell ahead as occupied if the agent has not moved since the last update: its step was refused."""
         if self.trail and np.linalg.norm(odometry[:2] - self.trail[-1]) < 1e-3:
             ahead = odometry[:2] + 2.5 * CELL * np.array([np.cos(odometry[2]), np.sin(odometry[2])])
-            self.occupied[to_cells(ahead[:1], ahead[1:])] = 1
+            self.occupied[self.to_cells(ahead[:1], ahead[1:])] = 1
 
     def find_free_cells(self) -> NDArray[np.bool_]:
         """Return the cells where the agent may stand: explored, and further than its radius from any obstacle."""
@@ -91,7 +118,7 @@ class ExplorationMap:
         steps = np.arange(CELL / 2, reach + 1e-9, CELL / 2)
         x = odometry[0] + steps * np.cos(azimuth)[:, None]
         y = odometry[1] + steps * np.sin(azimuth)[:, None]
-        clear = self.find_free_cells()[to_cells(x, y)]
+        clear = self.find_free_cells()[self.to_cells(x, y)]
         clear |= steps < 1.5 * CELL  # the agent stands there already
         runs = np.where(clear.all(1), reach, steps[np.argmin(clear, axis=1)] - CELL / 2)
         ends = odometry[:2] + runs[:, None] * np.stack([np.cos(azimuth), np.sin(azimuth)], 1)
@@ -99,7 +126,7 @@ class ExplorationMap:
 
     def sample_grid(self, values: NDArray[np.float64], points: NDArray[np.float64]) -> NDArray[np.float64]:
         """Return a grid's values at points [N, 2] in metres."""
-        return values[to_cells(points[:, 0], points[:, 1])]
+        return values[self.to_cells(points[:, 0], points[:, 1])]
 
     def distance_to_trail(self, points: NDArray[np.float64]) -> NDArray[np.float64]:
         """Return the metres from points [N, 2] to the nearest place the agent has been."""
@@ -112,7 +139,7 @@ class ExplorationMap:
         """
         free = self.find_free_cells()
         here = np.zeros_like(free)
-        row, column = to_cells(self.trail[-1][:1], self.trail[-1][1:])
+        row, column = self.to_cells(self.trail[-1][:1], self.trail[-1][1:])
         here[row, column] = free[row, column] = True
         way = compute_distance_field(free, here)
         worth = np.where(
@@ -129,13 +156,6 @@ class ExplorationMap:
         frontier = free & _dilate(unknown)
         labels, _ = ndimage.label(frontier, np.ones((3, 3)))
         return frontier & (np.bincount(labels.ravel())[labels] >= 3)
-
-
-def to_cells(x: NDArray[np.float64], y: NDArray[np.float64]) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
-    """Convert positions in metres to row and column, clipped to the map."""
-    row = np.clip(np.floor(x / CELL).astype(np.intp) + HALF, 0, 2 * HALF - 1)
-    column = np.clip(np.floor(y / CELL).astype(np.intp) + HALF, 0, 2 * HALF - 1)
-    return row, column
 
 
 def compute_distance_field(free: NDArray[np.bool_], sources: NDArray[np.bool_]) -> NDArray[np.float64]:
