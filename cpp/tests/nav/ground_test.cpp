@@ -67,7 +67,8 @@ TEST_CASE("slivers take memory by their area, and no point falls between them") 
   constexpr std::uint32_t kCorners = 4096;
   constexpr double kRadius = 250, kSlope = 0.1;
   for (std::uint32_t i = 0; i < kCorners; ++i) {
-    const double angle = 2 * EIGEN_PI * i / kCorners, x = kRadius * std::cos(angle), z = kRadius * std::sin(angle);
+    const double angle = 2 * double(EIGEN_PI) * i / kCorners, x = kRadius * std::cos(angle),
+                 z = kRadius * std::sin(angle);
     soup.vertices.emplace_back(float(x), float(kSlope * x), float(z));
     if (i >= 2) soup.triangles.push_back({0, i, i - 1});  // a fan, whose triangles are as long as the disc
   }

@@ -18,7 +18,7 @@ from wiw.analysis.statistics import Estimate, estimate_mean
 from wiw.analysis.summary import show_estimate
 from wiw.errors import ArgumentError
 from wiw.files import atomic_file
-from wiw.metrics.metric import SUCCESS
+from wiw.metrics.metric import SUCCESS, is_success
 from wiw.runs.rows import to_json
 from wiw.runs.store import RunStore
 from wiw.scenes import strip_edits
@@ -213,12 +213,7 @@ def list_failures(run: RunStore, arm: str) -> list[int]:
     judged = [row for row in run.outcomes() if row["arm"] == arm and row["status"] == "done"]
     if any("success" not in row["metrics"] for row in judged):
         raise ArgumentError(f"{run.path}: its task has no metric 'success', so none of its episodes counts as failed")
-    return [row["episode"] for row in judged if _is_failure(row)]
-
-
-def _is_failure(row: Mapping[str, Any]) -> bool:
-    """Return whether a scored episode failed; a part of a success, which a task of one's own may give, is a failure."""
-    return bool(row["metrics"]["success"] < 1)
+    return [row["episode"] for row in judged if not is_success(row["metrics"])]
 
 
 def list_reruns(run: RunStore, arm: str) -> list[str]:
@@ -243,7 +238,7 @@ def _read_arm(run: RunStore, arm: str, reruns: Mapping[tuple[str, int], Mapping[
         if cause := _find_error(rows):
             errors[episode] = cause
         elif all(row is not None for row in rows.values()):
-            success = {name: not _is_failure(row) for name, row in rows.items() if row is not None}
+            success = {name: is_success(row["metrics"]) for name, row in rows.items() if row is not None}
             examined.append(EpisodeBlame(arm, episode, scenes[episode], success, scheme))
     return ArmBlame(
         arm,

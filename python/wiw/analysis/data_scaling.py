@@ -283,7 +283,8 @@ def fit_power_law(sizes: Sequence[int], values: Sequence[Draws]) -> PowerLaw:
     """Fit a + b (K / K_1)^-c by least squares, anew in each draw; a and b are not below 0, c is one of `EXPONENTS`."""
     relative = np.array(sizes, np.float64) / sizes[0]
     fitted = _fit(relative, np.array([[each.value for each in values]]))[0]
-    drawn = _fit(relative, np.stack([each.drawn for each in values], axis=1))
+    draws = np.stack([each.drawn for each in values], axis=1)
+    drawn = np.where(np.isnan(draws).any(axis=1, keepdims=True), np.nan, _fit(relative, draws))
     return PowerLaw(*(Draws(float(value), drawn[:, i]).interval() for i, value in enumerate(fitted)))
 
 

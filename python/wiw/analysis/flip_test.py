@@ -23,8 +23,12 @@ MOST_ENUMERATED = 14
 """Scenes with a difference up to which all flips are tried where the sums are not whole numbers, or too large."""
 DRAWS = 20_000
 """Flips that are drawn at random beyond that."""
-LARGEST_SUM = 1_000_000
-"""Sum of sizes up to which whole numbers have the probability of each sum computed; beyond it takes too much memory."""
+LARGEST_SUM, MOST_WORK = 1_000_000, 200_000_000
+"""Sum of sizes, and its product with their number, up to which whole numbers have the probability of each sum computed:
+beyond it takes too much memory, or seconds.
+"""
+BLOCK = 2_000_000
+"""Signs that are drawn at a time."""
 
 
 def find_p_value(
@@ -62,7 +66,8 @@ def flip_signs(sums: Array, seed: int = 0) -> float:
     seen = abs(float(sums.sum())) - 1e-9 * float(sizes.sum())
     if len(sizes) == 0:
         return 1.0
-    if sizes.sum() <= LARGEST_SUM and np.array_equal(sizes, np.round(sizes)):
+    total = sizes.sum()
+    if total <= LARGEST_SUM and len(sizes) * total <= MOST_WORK and np.array_equal(sizes, np.round(sizes)):
         shares = _spread_whole_numbers(sizes.astype(int))
         far = np.abs(np.arange(len(shares)) - len(shares) // 2) >= seen
         return min(1.0, float(shares[far].sum()))
@@ -71,8 +76,11 @@ def flip_signs(sums: Array, seed: int = 0) -> float:
         for size in sizes:
             totals = np.concatenate([totals + size, totals - size])
         return float(np.mean(np.abs(totals) >= seen))
-    signs = np.random.Generator(np.random.Philox(key=seed)).integers(2, size=(DRAWS, len(sizes))) * 2 - 1
-    return float((1 + np.sum(np.abs(signs @ sizes) >= seen)) / (1 + DRAWS))
+    rng, count, rows = np.random.Generator(np.random.Philox(key=seed)), 0, max(1, BLOCK // len(sizes))
+    for begin in range(0, DRAWS, rows):
+        signs = rng.integers(2, size=(min(rows, DRAWS - begin), len(sizes))) * 2 - 1
+        count += int(np.sum(np.abs(signs @ sizes) >= seen))
+    return (1 + count) / (1 + DRAWS)
 
 
 def approximate_flips(sums: Array) -> Array:

@@ -31,6 +31,8 @@ assumption counts for. Few successes cannot show whether they gather in few scen
 LENGTH_WEIGHT = 2
 """Made-up episodes that steady lengths, one at either end of their range, each worth as many real ones as the design
 effect (as Agresti and Coull, 1998, steady proportions with four)."""
+BLOCK = 2_000_000
+"""Clusters of the bootstrap that are drawn at a time."""
 HALVINGS = 40
 """Steps of the bisection for an end of Tango's interval: to 2e-12."""
 
@@ -290,8 +292,12 @@ def clustered_bootstrap(
     sums, counts = sum_by_cluster(np.asarray(values, np.float64), np.asarray(clusters))
     if len(sums) < 2:
         raise ArgumentError(f"clustered_bootstrap: expected at least 2 clusters, got {len(sums)}")
-    draws = np.random.Generator(np.random.Philox(key=seed)).integers(len(sums), size=(resamples, len(sums)))
-    means = sums[draws].sum(1) / counts[draws].sum(1)
+    rng, rows = np.random.Generator(np.random.Philox(key=seed)), max(1, BLOCK // len(sums))
+    blocks = []
+    for begin in range(0, resamples, rows):
+        draws = rng.integers(len(sums), size=(min(rows, resamples - begin), len(sums)))
+        blocks.append(sums[draws].sum(1) / counts[draws].sum(1))
+    means = np.concatenate(blocks)
     tails = np.array([0.5 - confidence / 2, 0.5 + confidence / 2])
     if method == "bca":
         tails = _bca_levels(means, sums, counts, tails)

@@ -683,9 +683,15 @@ def _describe_missing(line: ArmSummary) -> str:
 
 
 def _explain_intervals(summary: Summary) -> list[str]:
-    first = next((estimate for line in summary.arms for estimate in line.estimates.values()), None)
-    if first is None:
+    found = {line.name: next(iter(line.estimates.values())) for line in summary.arms if line.estimates}
+    if not found:
         return []
+    widest = max(found.values(), key=lambda estimate: (estimate.scenes, estimate.n))
+    fewer = [f"{name} over {each.scenes}" for name, each in found.items() if each.scenes != widest.scenes]
+    return [*_explain_interval(widest), *([f"So far, intervals of {', '.join(fewer)}."] if fewer else [])]
+
+
+def _explain_interval(first: Estimate) -> list[str]:
     if first.scenes == 1:
         return [f"95 % intervals over episodes of one scene ({first.method}); they do not generalise to other scenes."]
     if first.scenes == first.n:

@@ -74,6 +74,11 @@ class Metric:
         return {**metrics, self.name: value}
 
 
+def is_success(metrics: Mapping[str, float]) -> bool:
+    """Return whether an episode counts as a success; a part of one, which a task of one's own may give, does not."""
+    return metrics.get("success", 0) >= 1
+
+
 SUCCESS = Metric("success", "SR", "rate", True, about="Success rate: percent of episodes that succeeded.")
 SPL = Metric("spl", "SPL", "rate", True, about="Success weighted by path length, in percent.")
 SPL_RULE = (

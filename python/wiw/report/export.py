@@ -65,13 +65,18 @@ def tables(run: Run) -> dict[str, Table]:
         "arms": [dict(line) for line in arm_table(run)],
         "episodes": _tabulate_episodes(run),
         "outcomes": [
-            _drop_nested({**row, **row["metrics"], "details": to_json(row["details"])}, "metrics")
+            _drop_nested({**row, **_name_metrics(row), "details": to_json(row["details"])}, "metrics")
             for row in run.store.outcomes()
         ],
         "decisions": [_flatten_decision(row) for row in decisions],
         "candidates": [candidate for row in decisions for candidate in _list_candidates(row)],
         **further,
     }
+
+
+def _name_metrics(outcome: Mapping[str, Any]) -> dict[str, float]:
+    """Return an outcome's metrics by the names of their columns: "metric_NAME" where another column has that name."""
+    return {f"metric_{name}" if name in outcome else name: value for name, value in outcome["metrics"].items()}
 
 
 def list_judgements(run: Run) -> Table:

@@ -5,6 +5,7 @@ from __future__ import annotations
 
 import json
 import math
+from bisect import bisect_left
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
@@ -67,11 +68,12 @@ def _render_within(run: Run, episodes: int | None, max_mb: float, remark: str) -
         return len(page.encode()) <= max_mb * 10**6
 
     findings, pictured = _gather_findings(run), len(choose_pictured_episodes(run.store))
-    for count in range(pictured if episodes is None else min(episodes, pictured), 0, -1):
-        smallest = _render_page(run, findings, count, SCALES[-1], remark)
-        if fits(smallest):
-            larger = (_render_page(run, findings, count, scale, remark) for scale in SCALES[:-1])
-            return next(filter(fits, larger), smallest)
+    most = pictured if episodes is None else min(episodes, pictured)
+    count = bisect_left(
+        range(1, most + 1), True, key=lambda each: not fits(_render_page(run, findings, each, SCALES[-1], remark))
+    )  # the most that fit: each episode adds to the page
+    if count > 0:
+        return next(filter(fits, (_render_page(run, findings, count, scale, remark) for scale in SCALES)))
     bare = _render_page(run, findings, 0, 1.0, remark)
     if not fits(bare):
         size = len(bare.encode()) / 10**6

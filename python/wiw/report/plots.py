@@ -28,7 +28,7 @@ from wiw.analysis.marks import BLIND
 from wiw.analysis.quality import QualityTable
 from wiw.analysis.statistics import estimate_mean
 from wiw.analysis.summary import Summary
-from wiw.metrics.metric import SUCCESS
+from wiw.metrics.metric import SUCCESS, is_success
 from wiw.scenes import strip_edits
 from wiw.types import Wording
 
@@ -403,7 +403,7 @@ def shows_single_outcomes(outcomes: Outcomes) -> bool:
 def _draw_outcome_dots(axes: Axes, outcomes: Outcomes, colors: Mapping[str, str]) -> None:
     for y, (arm, rows) in enumerate(reversed(list(outcomes.items()))):
         for row in rows:
-            filled = colors[arm] if row["metrics"].get("success") else "none"
+            filled = colors[arm] if is_success(row["metrics"]) else "none"
             axes.plot(row["geodesic"], y, "o", ms=9, mfc=filled, mec=colors[arm], mew=1.6, alpha=0.9, clip_on=False)
     axes.set_yticks(range(len(outcomes)), [_fold(arm) for arm in reversed(list(outcomes))])
     axes.set_ylim(-0.6, len(outcomes) - 0.4)

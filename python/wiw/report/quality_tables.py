@@ -12,7 +12,7 @@ from rich.text import Text
 from wiw.analysis.quality import CONTROL, PAPER_QUALITY, QualityTable
 from wiw.analysis.rank_correlation import Correlation
 from wiw.analysis.statistics import Estimate
-from wiw.analysis.summary import show_estimate
+from wiw.analysis.summary import show_estimate, show_p
 from wiw.report.tables import ROOMY, Column, print_stacked, show_count, stack_tables
 
 ABOUT = {
@@ -42,7 +42,7 @@ def show_rank(found: Correlation) -> list[str]:
     if math.isnan(found.rho):
         return ["–", "–", "–", str(found.arms)]
     interval = "–" if math.isnan(found.low) else f"[{found.low:+.2f}, {found.high:+.2f}]"
-    return [f"{found.rho:+.2f}", interval, f"{found.p:.3f}", str(found.arms)]
+    return [f"{found.rho:+.2f}", interval, show_p(found.p), str(found.arms)]
 
 
 def arm_rows(table: QualityTable) -> tuple[list[str], list[list[str]]]:

@@ -15,6 +15,7 @@ from typing import Any
 
 from wiw._core import core
 from wiw.files import atomic_folder
+from wiw.metrics.metric import is_success
 from wiw.report.beliefs import read_verdict
 from wiw.report.episodes import make_title, outcomes_by_episode, read_story, read_wording
 from wiw.report.plots import arm_colors
@@ -207,14 +208,14 @@ def _make_cell(arm: str, outcome: Mapping[str, Any] | None, words: Wording, choi
         return Cell(arm, "error", "error", "infrastructure error, excluded from scores")
     verdict = read_verdict(outcome["details"])
     if verdict is not None:
-        state = "success" if outcome["metrics"].get("success") else "failure"
+        state = "success" if is_success(outcome["metrics"]) else "failure"
         return Cell(arm, state, verdict.answer or "no answer", f"{verdict.text}; its answer")
     return _make_number_cell(arm, outcome["metrics"], words, choices)
 
 
 def _make_number_cell(arm: str, metrics: Mapping[str, Any], words: Wording, choices: Sequence[str]) -> Cell:
     count = f"{metrics['decisions']:.0f}" if "decisions" in metrics else ""
-    if metrics.get("success"):
+    if is_success(metrics):
         return Cell(arm, "success", count, f"{words.won}; number of decisions")
     if choices:
         return Cell(arm, "failure", final_answer(metrics, choices) or "no answer", f"{words.lost}; its answer")

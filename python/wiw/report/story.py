@@ -14,6 +14,7 @@ from typing import Any
 import numpy as np
 from PIL import Image
 
+from wiw.metrics.metric import is_success
 from wiw.report import cuts
 from wiw.report.beliefs import Belief, Verdict, list_expected
 from wiw.report.maps import MapFrame, Mark, Trail
@@ -163,7 +164,7 @@ class Attempt:
     @property
     def success(self) -> bool:
         """Whether the episode was a success."""
-        return bool(self.outcome["metrics"].get("success"))
+        return is_success(self.outcome["metrics"])
 
     @property
     def text(self) -> str:

@@ -5,6 +5,7 @@ from __future__ import annotations
 
 import re
 from collections.abc import Mapping, Sequence
+from itertools import chain, count
 from pathlib import Path
 from typing import Any, Protocol
 
@@ -52,7 +53,8 @@ def write_study(plan: Any, parts: Sequence[Any], numbers: str, folder: Path) -> 
     for part, own in zip(parts, figures, strict=True):
         for title, _, drawing in own:
             name = re.sub(r"\W+", "-", f"{part.run.name} {title}".lower()).strip("-")
-            contents[f"{name}.svg"] = str(drawing)
+            names = chain([f"{name}.svg"], (f"{name}-{number}.svg" for number in count(2)))
+            contents[next(each for each in names if each not in contents)] = str(drawing)
     return write_files(folder, contents)
 
 

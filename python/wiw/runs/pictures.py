@@ -10,6 +10,7 @@ from __future__ import annotations
 from collections.abc import Collection, Mapping, Sequence
 from typing import Any
 
+from wiw.metrics.metric import is_success
 from wiw.runs.recipes import CHANGES
 from wiw.runs.store import RunStore
 from wiw.types import Episode
@@ -83,7 +84,7 @@ def drop_spare_pictures(store: RunStore) -> None:
 def _rate_gain(index: int, outcomes: Sequence[Mapping[str, Any]]) -> tuple[int, int]:
     """Return how many models, and whether the ceiling, succeed in an episode in which the floor fails."""
     success = {
-        row["arm"]: bool(row["metrics"].get("success"))
+        row["arm"]: is_success(row["metrics"])
         for row in outcomes
         if row["episode"] == index and row["status"] == "done"
     }

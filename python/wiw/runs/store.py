@@ -468,7 +468,8 @@ class RunStore:
     def recorded_outcomes(self) -> list[dict[str, Any]]:
         """Return the ended episodes as the run recorded them, with the marks of its own judge."""
         rows = self._rows(
-            "SELECT o.*, e.episode_id, e.scene, e.geodesic, json_extract(e.info, '$.task') AS task "
+            "SELECT o.*, e.episode_id, e.scene, e.geodesic, json_extract(e.info, '$.task') AS task, "
+            "json_extract(e.info, '$.tier') AS tier "
             "FROM outcome o JOIN episode e USING (episode) "
             "ORDER BY arm, episode"
         )
@@ -478,7 +479,7 @@ class RunStore:
             if row["arm"] not in arms:
                 place = self._place("outcome", row)
                 raise StoreError(f"{place}: expected an arm of the run: {', '.join(arms)}; {EDITED}")
-        named = [row if row["task"] else {name: row[name] for name in row if name != "task"} for row in rows]
+        named = [{name: value for name, value in row.items() if value or name not in ("task", "tier")} for row in rows]
         return [
             {**row, **{name: parse_column(name, row[name], self._place("outcome", row)) for name in OUTCOME_JSON}}
             for row in named

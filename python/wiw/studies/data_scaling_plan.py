@@ -70,8 +70,10 @@ class ScalingSettings:
     decisions_per_scene: int = 30
 
     def __post_init__(self) -> None:
-        if unknown := [name for name in self.models if name not in LEARNERS] or not self.models:
-            raise ArgumentError(f"data-scaling: expected models among {', '.join(LEARNERS)}, got {unknown}")
+        unknown = [name for name in self.models if name not in LEARNERS]
+        if unknown or not self.models:
+            got = ", ".join(unknown) or "none"
+            raise ArgumentError(f"data-scaling: expected models among {', '.join(LEARNERS)}, got {got}")
         for name, few in (("models", self.models), ("seeds", self.seeds)):
             if not few or len(set(few)) < len(few):
                 raise ArgumentError(f"data-scaling: expected different {name}, got {few}")

@@ -159,12 +159,13 @@ def _list_amounts(
     if candidates is None and fractions is None:
         candidates = CANDIDATES
     for name, values in (("candidates", candidates), ("imagine_fraction", fractions)):
-        if values is not None and (not values or len(set(values)) < len(values)):
+        if values is not None and (not values or len({f"{value:g}" for value in values}) < len(values)):
             raise ArgumentError(f"scale: expected different values of {name}, got {list(values)}")
-    if min(candidates or [1]) < 1 or not all(0 <= share <= 1 for share in fractions or []):
+    are_whole = all(count >= 1 and count == int(count) for count in candidates or [])
+    if not are_whole or not all(0 <= share <= 1 for share in fractions or []):
         raise ArgumentError(
-            f"scale: expected candidates of at least 1 and an imagine_fraction from 0 to 1, got {candidates} and "
-            f"{fractions}"
+            "scale: expected whole numbers of candidates of at least 1, and an imagine_fraction from 0 to 1, got "
+            f"{candidates} and {fractions}"
         )
     pool = max(candidates or [1])
     found: dict[tuple[str, float], dict[str, Any]] = {

@@ -2,6 +2,7 @@
 import io
 import math
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 import pytest
@@ -11,6 +12,7 @@ from rich.console import Console
 from scipy import stats
 
 import wiw
+from wiw.analysis import flip_test, intervals
 from wiw.analysis.flip_test import DRAWS, approximate_flips, find_p_value, flip_signs
 from wiw.analysis.intervals import (
     clustered_bootstrap,
@@ -26,7 +28,7 @@ from wiw.analysis.intervals import (
     wilson,
 )
 from wiw.analysis.statistics import compare, compute_p_value, estimate_difference, estimate_mean, holm
-from wiw.analysis.summary import load_metrics, notes, show_estimate, summarise
+from wiw.analysis.summary import load_metrics, notes, show_estimate, split_outcomes, summarise
 from wiw.errors import ArgumentError
 from wiw.report.page import sentence, summary_html
 from wiw.report.tables import SummaryTable
@@ -321,6 +323,42 @@ def test_variance_over_scenes_is_the_cluster_robust_one_of_statsmodels():
     fit = sm.OLS(data, np.ones(48)).fit(cov_type="cluster", cov_kwds={"groups": scenes})
     sums, counts = sum_by_cluster(data, scenes)
     assert jackknife_covariance(sums, sums, counts) == pytest.approx(fit.bse[0] ** 2)
+
+
+def test_draws_in_blocks_are_those_at_once(monkeypatch: pytest.MonkeyPatch) -> None:
+    values = np.random.default_rng(3).normal(0.1, 1, 60)
+    found = [(flip_signs(values), clustered_bootstrap(values, np.arange(60)))]
+    for module in (flip_test, intervals):
+        monkeypatch.setattr(module, "BLOCK", 1000)
+    found.append((flip_signs(values), clustered_bootstrap(values, np.arange(60))))
+    assert found[0] == found[1]
+
+
+def test_many_whole_numbers_are_flipped_at_random(monkeypatch: pytest.MonkeyPatch) -> None:
+    values = np.random.default_rng(3).integers(-9, 11, 80).astype(float)
+    exact = flip_signs(values)
+    monkeypatch.setattr(flip_test, "MOST_WORK", 0)
+    assert flip_signs(values) != exact and flip_signs(values) == pytest.approx(exact, abs=0.015)
+
+
+def test_what_a_task_did_not_measure_has_no_value() -> None:
+    known = {"success": 1.0, "actions": 9.0}
+    row = {"arm": "a", "scene": "s", "status": "done"}
+    rows = [{**row, "episode": i, "metrics": {**known, "spl": each}} for i, each in enumerate((0.5, None, math.nan))]
+    done, _ = split_outcomes(["a"], rows)
+    assert [each["metrics"].get("spl") for each in done["a"].values()] == [0.5, None, None]
+    assert "spl" not in summarise(["a"], rows, 3)["a"].estimates
+
+
+def test_notes_say_which_intervals_are_over_fewer_scenes() -> None:
+    def list_rows(arm: str, scenes: int) -> list[dict[str, Any]]:
+        metrics = {"success": 1.0, "actions": 9.0}
+        row = {"arm": arm, "status": "done", "metrics": metrics}
+        return [{**row, "episode": i, "scene": f"s{i // 2}"} for i in range(2 * scenes)]
+
+    said = " ".join(notes(summarise(["none", "warp"], [*list_rows("none", 1), *list_rows("warp", 20)], 40)))
+    assert "95 % intervals over 20 scenes. So far, intervals of none over 1." in said
+    assert "they do not generalise" not in said
 
 
 def test_lengths_over_many_scenes_are_students() -> None:

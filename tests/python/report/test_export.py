@@ -5,8 +5,10 @@ import csv
 import importlib.util
 import json
 import re
+import sqlite3
 import subprocess
 import sys
+from dataclasses import replace
 from pathlib import Path
 
 import pytest
@@ -15,7 +17,9 @@ from fakes import LineAgent, LineTask
 from wiw.cli import main
 from wiw.errors import ArgumentError, FileError
 from wiw.report.export import tables
+from wiw.runs.store_file import store_path
 from wiw.studies.evaluate import run_arms
+from wiw.studies.run_log import load_run
 
 EVIL = 'a,"b"\n/../c'
 TABLES = ("arms", "episodes", "outcomes", "decisions", "candidates", "anytime", "anytime_differences")
@@ -69,6 +73,23 @@ def test_parquet_says_what_the_run_says(log, tmp_path):
         log, lambda name: pandas.read_parquet(tmp_path / "parquet" / f"{name}.parquet").to_dict("records")
     )
     assert [r["executed"].tolist() for r in decisions] == [r["executed"] for r in log.decisions]
+
+
+class TieredTask(LineTask):
+    """Episodes of two tiers."""
+
+    def episodes(self, count):
+        tiers = ("near", "far")
+        return [replace(each, info={"tier": tiers[i % 2]}) for i, each in enumerate(super().episodes(count))]
+
+
+def test_outcomes_have_their_tier_and_keep_their_columns(tmp_path):
+    log = run_arms(TieredTask(), {"none": LineAgent()}, 2, out=tmp_path / "run", progress=False)
+    with sqlite3.connect(store_path(log.path)) as store:
+        store.execute("""UPDATE outcome SET metrics = json_set(metrics, '$.seconds', 7.0, '$.kind', 1.0)""")
+    rows = tables(load_run(log.path))["outcomes"]
+    assert [row["tier"] for row in rows] == ["near", "far"]
+    assert all((row["kind"], row["metric_kind"], row["metric_seconds"]) == ("", 1, 7) for row in rows)
 
 
 def test_every_column_is_described(log):

@@ -20,6 +20,7 @@ from wiw.analysis.data_scaling import (
     EQUAL_UPDATES,
     FEWER_SCENES,
     ONE_EPOCH,
+    Draws,
     Resampled,
     ScalingArm,
     ScalingTable,
@@ -94,6 +95,16 @@ def test_a_power_law_is_found_again_and_its_interval_holds_it() -> None:
     assert found.b.value == pytest.approx(5, abs=0.05) and found.c.value == pytest.approx(0.5, abs=0.011)
     assert found.a.value == pytest.approx(10 + scenes.mean(), abs=0.05)
     assert found.a.low < found.a.value < found.a.high and found.b.high - found.b.low < 0.1  # scenes move a alone
+
+
+def test_draws_that_lack_a_training_have_no_part_in_the_interval_of_a_fit() -> None:
+    sizes, rng = (32, 144, 688), np.random.default_rng(0)
+    truth = 10 + 5 * (np.array(sizes) / 32) ** -0.5
+    drawn = truth[:, None] + rng.normal(0, 0.01, (3, 400))
+    whole = fit_power_law(sizes, [Draws(value, own) for value, own in zip(truth, drawn, strict=True)])
+    drawn[1, ::3] = np.nan
+    found = fit_power_law(sizes, [Draws(value, own) for value, own in zip(truth, drawn, strict=True)])
+    assert whole.c.low > 0.4 and found.c.low == pytest.approx(whole.c.low, abs=0.03)
 
 
 def test_a_fit_is_as_good_as_that_of_a_general_optimiser() -> None:

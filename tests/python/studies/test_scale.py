@@ -109,6 +109,20 @@ def test_an_agent_of_another_method_is_refused() -> None:
         wiw.scale("imagenav", LineAgent(0.0))
 
 
+@pytest.mark.parametrize(
+    "amounts",
+    [
+        {"candidates": [2, 2.5]},
+        {"imagine_fraction": [0.1234567, 0.1234568]},
+        {"candidates": [0]},
+        {"candidates": [2, 2]},
+    ],
+)
+def test_amounts_that_would_be_alike_are_refused(amounts) -> None:
+    with pytest.raises(ArgumentError, match="scale: expected"):
+        wiw.scale("ImageNav-v0", AgentRecipe("heuristic", "oracle"), **amounts)
+
+
 def test_images_are_kept_where_they_are_asked_for_and_results_appear_whole(two_rooms, tmp_path, monkeypatch) -> None:
     agent, options = AgentRecipe("heuristic", "copy", reviser="matcher"), {"scenes": two_rooms, "decisions": 1}
     pictures = {}

@@ -17,6 +17,7 @@ from fakes import LineAgent, LineTask
 import wiw
 from wiw.cli.app import main
 from wiw.errors import ArgumentError, FileError, StoreError
+from wiw.report import study_page
 from wiw.runs.config import RunConfig
 from wiw.studies.evaluate import run_arms
 from wiw.studies.study import StudyPart, _adjust, _compare
@@ -287,3 +288,12 @@ def test_pairs_of_a_run_that_was_looked_at_have_the_p_of_bets(tmp_path: Path) ->
         found = {each.metric: each.p_value for each in _compare(run, log)}
         assert found == {each.metric: each.p_value for each in log.numbers().differences}
     assert found["actions"] == 1
+
+
+def test_figures_of_runs_of_like_names_are_all_kept(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(study_page, "list_figures", lambda part: [("Success", "", part.run.name)])
+    monkeypatch.setattr(study_page, "render_study", lambda *_: "page")
+    parts = [SimpleNamespace(run=SimpleNamespace(name=name)) for name in ("near@1", "near:1", "Near@1")]
+    study_page.write_study(None, parts, "{}", tmp_path)
+    drawn = sorted(each.read_text() for each in tmp_path.glob("*.svg"))
+    assert drawn == ["Near@1", "near:1", "near@1"]
