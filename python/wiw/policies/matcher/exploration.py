@@ -46,7 +46,7 @@ class ExplorationMap:
     @property
     def centres(self) -> NDArray[np.float64]:
         """Middles of the cells along each axis in metres, float64 [2 * half]."""
-        return (np.arange(2 * self.half) - self.half + 0.5) * CELL
+        return np.asarray((np.arange(2 * self.half) - self.half + 0.5) * CELL, np.float64)
 
     def to_cells(self, x: NDArray[np.float64], y: NDArray[np.float64]) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
         """Convert positions in metres to row and column, clipped to the map."""
