@@ -229,11 +229,16 @@ def _import_file(path: Path) -> Any:
     module = importlib.util.module_from_spec(importlib.util.spec_from_loader(name, loader))  # type: ignore[arg-type]
     module.__dict__[SOURCES] = f"{path.name} {digest_imports(path)}"
     sys.modules[name] = module
-    try:  # from the source itself: bytecode on disk tells edits of the same length in the same second not apart
+    # From the source itself, and nothing is written for modules next to it: bytecode on disk tells edits of the same
+    # length in the same second not apart.
+    writes_nothing, sys.dont_write_bytecode = sys.dont_write_bytecode, True
+    try:
         exec(loader.source_to_code(path.read_bytes(), str(path)), module.__dict__)  # noqa: S102 - named by the user
     except BaseException:
         del sys.modules[name]
         raise
+    finally:
+        sys.dont_write_bytecode = writes_nothing
     return module
 
 

@@ -47,6 +47,8 @@ def find_p_value(
         seed: of the flips, where not all are tried.
     """
     data = np.asarray(differences, np.float64)
+    if not np.isfinite(data).all():  # nothing was measured somewhere, so nothing is shown
+        return 1.0
     sums, counts = sum_by_cluster(data, np.asarray(scenes))
     if len(sums) == 1:
         return flip_signs(data, seed)

@@ -9,7 +9,7 @@ import warnings
 from collections import Counter
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
-from functools import cache
+from functools import cache, reduce
 from typing import Any
 
 from wiw.analysis.breakdowns import (
@@ -466,7 +466,7 @@ def split_outcomes(
 ) -> tuple[dict[str, dict[int, Mapping[str, Any]]], dict[str, int]]:
     """Return by arm the scored episodes, by index and with all metrics, and the number of errors.
 
-    Where a task measured nothing, None or NaN, the episode has no value of that metric.
+    What a task has measured as no finite number is NaN, as are then its mean and differences.
     An edited copy of an apartment counts as the same scene: intervals are over apartments.
     """
     known = load_metrics()
@@ -474,11 +474,8 @@ def split_outcomes(
     errors = dict.fromkeys(arms, 0)
     for outcome in outcomes:
         if outcome["status"] == "done":
-            metrics: Mapping[str, float] = {
-                name: value for name, value in outcome["metrics"].items() if _is_measured(value)
-            }
-            for metric in known:
-                metrics = metric.add_to(metrics)
+            measured = {name: math.nan if value is None else value for name, value in outcome["metrics"].items()}
+            metrics = reduce(_add_metric, known, measured)
             scene = strip_edits(outcome["scene"])
             done[outcome["arm"]][outcome["episode"]] = {**outcome, "scene": scene, "metrics": metrics}
         else:
@@ -486,8 +483,8 @@ def split_outcomes(
     return done, errors
 
 
-def _is_measured(value: Any) -> bool:
-    return value is not None and not math.isnan(value)
+def _add_metric(metrics: Mapping[str, float], metric: Metric) -> Mapping[str, float]:
+    return metric.add_to(metrics)
 
 
 def find_cause(arm: str, outcomes: Sequence[Mapping[str, Any]]) -> str:
@@ -711,6 +708,8 @@ def _explain_unknown(summary: Summary) -> list[str]:
     """Return why an interval is not known, where that is so."""
     estimates = [estimate for line in summary.arms for estimate in line.estimates.values()]
     estimates += [difference.estimate for difference in summary.differences]
+    if any(math.isnan(estimate.value) for estimate in estimates):
+        return ["nan [?]: unknown, as the task has measured no number in some episodes."]
     if not any(math.isnan(estimate.low) for estimate in estimates):
         return []
     return ["[?]: unknown, as lengths of one episode, or that are all 0, do not show how far apart lengths may lie."]

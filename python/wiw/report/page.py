@@ -18,7 +18,7 @@ from wiw.analysis.costs import cost_columns, costs
 from wiw.analysis.fidelity import ArmFidelity, choose_columns, fidelity
 from wiw.analysis.marks import BLIND
 from wiw.analysis.statistics import Difference
-from wiw.analysis.summary import Summary, list_columns, notes, show_p, summarise_run
+from wiw.analysis.summary import ANOTHER_POLICY, WORLD_MODEL, Summary, list_columns, notes, show_p, summarise_run
 from wiw.errors import ArgumentError
 from wiw.files import atomic_file
 from wiw.metrics.metric import SPL_RULE
@@ -154,14 +154,16 @@ def _list_tiers(summary: Summary) -> list[dict[str, Any]]:
 def sentence(summary: Summary, words: Wording | None = None) -> str:
     """Return the result in a few sentences that claim no more than the adjusted tests support."""
     judged = [line for line in summary.arms if "success" in line.estimates and line.name != "none"]
-    shown = [line for line in judged if line.role == "world model"]
+    models, policies = ([line for line in judged if line.role == role] for role in (WORLD_MODEL, ANOTHER_POLICY))
+    shown = models or policies[-1:]
     parts = []
     for line in shown[:3]:
         share = line.estimates["success"].value
         count = f"{line.scored_of_total} episode{'' if line.scored_of_total == '1' else 's'}"
         rate = f"With {line.name}, the agent succeeded in {share:.1f} % of {count}"
         found = (_find_difference(summary, line.name, "none", metric) for metric in ("success", "actions"))
-        parts.append(rate + _describe_gain(next(found)) + _describe_actions(next(found), words or Wording()))
+        base = "without a world model" if line.role == WORLD_MODEL else "none"
+        parts.append(rate + _describe_gain(next(found), base) + _describe_actions(next(found), words or Wording()))
     return " ".join(parts)
 
 
@@ -191,11 +193,11 @@ def explain_metrics(summary: Summary, words: Wording) -> list[tuple[str, str]]:
     return found
 
 
-def _describe_gain(difference: Difference | None) -> str:
+def _describe_gain(difference: Difference | None, base: str) -> str:
     if difference is None:
         return "."
     found = difference.estimate
-    against = f"{abs(found.value):.1f} points {'more' if found.value >= 0 else 'fewer'} than without a world model"
+    against = f"{abs(found.value):.1f} points {'more' if found.value >= 0 else 'fewer'} than {base}"
     interval = f"95 % interval {format_signed(found.low)} to {format_signed(found.high)}"
     if difference.is_shown:
         return f", {against} ({interval})."

@@ -28,7 +28,7 @@ from wiw.analysis.intervals import (
     wilson,
 )
 from wiw.analysis.statistics import compare, compute_p_value, estimate_difference, estimate_mean, holm
-from wiw.analysis.summary import load_metrics, notes, show_estimate, split_outcomes, summarise
+from wiw.analysis.summary import load_metrics, notes, show_estimate, summarise
 from wiw.errors import ArgumentError
 from wiw.report.page import sentence, summary_html
 from wiw.report.tables import SummaryTable
@@ -341,13 +341,18 @@ def test_many_whole_numbers_are_flipped_at_random(monkeypatch: pytest.MonkeyPatc
     assert flip_signs(values) != exact and flip_signs(values) == pytest.approx(exact, abs=0.015)
 
 
-def test_what_a_task_did_not_measure_has_no_value() -> None:
-    known = {"success": 1.0, "actions": 9.0}
-    row = {"arm": "a", "scene": "s", "status": "done"}
-    rows = [{**row, "episode": i, "metrics": {**known, "spl": each}} for i, each in enumerate((0.5, None, math.nan))]
-    done, _ = split_outcomes(["a"], rows)
-    assert [each["metrics"].get("spl") for each in done["a"].values()] == [0.5, None, None]
-    assert "spl" not in summarise(["a"], rows, 3)["a"].estimates
+@pytest.mark.parametrize("scenes", [1, 4, 20])
+def test_what_a_task_did_not_measure_shows_nothing(scenes: int) -> None:
+    rows = []
+    for arm, base in (("none", 0.1), ("warp", 0.6)):
+        for i in range(20):
+            spl = (None if i == 2 else math.nan if i == 3 else base + 0.01 * i) if arm == "warp" else base
+            metrics = {"success": 1.0, "actions": 9.0, "spl": spl}
+            rows.append({"arm": arm, "episode": i, "scene": f"s{i % scenes}", "status": "done", "metrics": metrics})
+    summary = summarise(["none", "warp"], rows, 20)
+    (found,) = [each for each in summary.differences if each.metric == "spl"]
+    assert math.isnan(found.estimate.value) and found.p_value == 1 and not found.is_shown
+    assert "the task has measured no number in some episodes" in " ".join(notes(summary))
 
 
 def test_notes_say_which_intervals_are_over_fewer_scenes() -> None:
