@@ -50,9 +50,9 @@ _VERBS = _FORMS_OF_BE | _NOTICED - {"any"} | {"do", "does", "think"}
 """Words of which a statement has one; "it" alone affirms nothing."""
 _OPPOSITES = (("open", "closed"), ("on", "off"), ("made", "unmade"))
 OPPOSITE_STATES = {one: other for pair in _OPPOSITES for one, other in (pair, pair[::-1])}
-_UNCOUNTED = _UNSURE | {"know", "tell", "sure", "certain", "idea", "count", "many", "much"}
-"""Words of an answer with "not" that is no zero: "I do not know", "no idea", "not many"."""
-_AMOUNTS = frozenset({"few", "lot", "number", "bunch", "handful", "several", "some", "little", "lots"})
+_UNCOUNTED = frozenset({"know", "tell", "sure", "certain", "idea", "count", "say", "many", "much"})
+"""Words behind "not" or "no" (and one more word) that make it no zero: "I do not know", "no idea", "not many"."""
+_AMOUNTS = frozenset({"few", "lot", "number", "bunch", "handful", "several", "some", "lots"})
 """Words behind an article that is no number: "a few chairs", "a small number"."""
 _PAIRS = frozenset({"couple", "pair", "both"})
 _LEADS = (["there", "is"], ["i", "see"], ["i", "found"])
@@ -150,8 +150,10 @@ def read_counts(text: str) -> list[int]:
         return list(dict.fromkeys(counts))
     if any(word in _PAIRS for word in words):
         return [2]
-    if any(word in NEGATIONS for word in words):
-        return [0] if "none" in words or not _UNCOUNTED & set(words) else []
+    negations = [place for place, word in enumerate(words) if word in NEGATIONS]
+    if negations:
+        doubts = [_UNCOUNTED & set(words[place + 1 : place + 3]) for place in negations if words[place] != "none"]
+        return [] if any(doubts) else [0]
     named = raw[2:] if raw[:2] in _LEADS else raw
     if _AMOUNTS & set(named[1:3]):
         return []

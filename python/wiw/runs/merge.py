@@ -16,7 +16,7 @@ from inspect import isfunction
 from pathlib import Path
 from typing import Any
 
-from wiw.errors import Error, StoreError
+from wiw.errors import Error, FileError, StoreError
 from wiw.file_systems import find_network
 from wiw.files import atomic_file
 from wiw.registry import POLICIES, TASKS, WORLD_MODELS
@@ -116,9 +116,24 @@ def merge(stores: Sequence[str | Path], out: str | Path, scratch: str | Path | N
         except BaseException:
             target.abandon()
             raise
-        target.close()
+        _close_merged(target, out)
     pending = {arm: count for arm, count in left.items() if count}
     return Merged(Path(out), len(parts), sum(map(len, takes)), pending, repeated, tuple(unlike), undrawn)
+
+
+def _close_merged(target: RunStore, out: str | Path) -> None:
+    """Write a merged run where it belongs.
+
+    Raises:
+        FileError: it cannot be written.
+    """
+    try:
+        target.close()
+    except (FileError, StoreError) as error:
+        raise FileError(
+            f"{out}: the merged run cannot be written ({error.__cause__ or error}); expected a writable folder with "
+            "free space. The stores that were merged are as they were: make room, then merge them again"
+        ) from error
 
 
 @contextmanager

@@ -105,6 +105,8 @@ def find_stores(runs: Sequence[str | Path]) -> list[Path]:
 def find_shards(run: str | Path) -> list[Path]:
     """Return the shards in the subfolders of a run that was merged from such; none of other runs, or one resumed since.
 
+    None either where one of the shards that it was merged from is not there: the merged run then has more.
+
     Raises:
         StoreError: one of the stores cannot be read.
     """
@@ -113,8 +115,12 @@ def find_shards(run: str | Path) -> list[Path]:
     if not inside:
         return []
     with RunStore.read(path) as store:
-        config, is_copy = store.config, "merged" in store.info and "session" not in store.info
-    return [folder for folder in inside if _is_shard(folder, config)] if is_copy else []
+        config, info = store.config, store.info
+    if "merged" not in info or "session" in info:
+        return []
+    found = {folder: shard for folder in inside if (shard := _read_shard(folder, config)) is not None}
+    merged = {(each["shard"], each["created"]) for each in info["merged"]}
+    return list(found) if merged <= set(found.values()) else []
 
 
 def list_marks(store: RunStore) -> set[tuple[str, str, int]]:
@@ -122,10 +128,11 @@ def list_marks(store: RunStore) -> set[tuple[str, str, int]]:
     return {(judge.digest, *key) for judge in store.judges for key in store.judged_outcomes(judge.digest)}
 
 
-def _is_shard(folder: Path, config: dict[str, Any]) -> bool:
-    """Return whether a store is a shard of a run of this configuration, rather than such as `wiw blame` keeps."""
+def _read_shard(folder: Path, config: dict[str, Any]) -> tuple[str, str] | None:
+    """Return which shard a store is and when it began; None for no shard of this run, such as `wiw blame` keeps."""
     with RunStore.read(folder) as store:
-        return store.shard is not None and store.config == config
+        is_shard = store.shard is not None and store.config == config
+        return (store.info["shard"], store.created) if is_shard else None
 
 
 def _list_inside(run: Path) -> list[Path]:

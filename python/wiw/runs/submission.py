@@ -44,6 +44,8 @@ ACTIVE = frozenset(
     )
 )
 """States of jobs that are or may be waiting or running: `sacct` does not know a new job for some seconds."""
+OVER = frozenset(("COMPLETED", "CANCELLED", "FAILED", "OUT_OF_MEMORY", "BOOT_FAIL", "DEADLINE"))
+"""States of jobs of SLURM that will not run again; after others, such as PREEMPTED or TIMEOUT, one may be requeued."""
 ENDED = ("Invalid job id specified", "already completing or completed")
 """What `scancel` says of jobs that have ended."""
 INVALID = 1
@@ -267,7 +269,7 @@ def find_active(run: str | Path) -> list[SubmittedJob]:
 
 
 def cancel(run: str | Path) -> list[SubmittedJob]:
-    """Cancel all jobs of a run that are waiting or running and return them; everything recorded is kept.
+    """Cancel all jobs of a run that run, or may still run, and return them; everything recorded is kept.
 
     Raises:
         StoreError: no jobs were submitted for it, or the list of them is damaged.
@@ -277,16 +279,16 @@ def cancel(run: str | Path) -> list[SubmittedJob]:
     jobs = read_jobs(folder)
     if not jobs:
         raise StoreError(f"no jobs of {run}: expected a folder of `wiw submit` with {FILE_NAME} in it")
-    active = find_active(folder)
-    told = [job for job in active if job.cluster == "local" and _end_controller(job.id)]
-    arrays = dict.fromkeys(_name_array(job) for job in active if job.cluster == "slurm")
+    told = [job for job in find_active(folder) if job.cluster == "local" and _end_controller(job.id)]
+    left = [job for job in find_states(folder) if job.cluster == "slurm" and job.state.partition(" ")[0] not in OVER]
+    arrays = dict.fromkeys(map(_name_array, left))
     said = {array: _cancel_array(array) for array in arrays}
     if failed := {array: text for array, text in said.items() if text and not _has_ended(text)}:
         raise InfrastructureError(
             f"scancel {' '.join(failed)}: {'; '.join(failed.values())}; expected a machine of the cluster from which "
             "the jobs were submitted"
         )
-    return told + [job for job in active if job.cluster == "slurm" and not said[_name_array(job)]]
+    return told + [job for job in left if not said[_name_array(job)]]
 
 
 def _parse(path: Path) -> list[Mapping[str, Any]]:

@@ -20,6 +20,7 @@ from contextlib import contextmanager
 from dataclasses import dataclass, field
 from multiprocessing import active_children, get_context
 from multiprocessing.connection import Connection, wait
+from types import FrameType
 from typing import Any, NoReturn, Protocol
 
 from wiw._core import core
@@ -39,6 +40,8 @@ _RESEED = 0x52455345
 """Keeps the seeds of arms that repeat another apart from all other draws."""
 TRIES = 2
 """How often an episode is started if its worker dies."""
+LOOK = 1.0
+"""Seconds between two looks whether workers have ended, whose pipes processes that they have started may hold open."""
 CLOSING = 2.0
 """Seconds that workers have to end at the end of a run, before they are killed."""
 NUMBERS = {2: "twice", 3: "three times"}
@@ -237,7 +240,7 @@ class _WorkerPool:
     def _await_news(self) -> None:
         """Wait for messages, receive them, and kill workers that have sent none for too long."""
         by_pipe = {worker.pipe: worker for worker in self._workers}
-        began, tick = time.monotonic(), choose_tick(self._patience)
+        began, tick = time.monotonic(), min(LOOK, choose_tick(self._patience))
         ready = wait(list(by_pipe), tick)
         for worker in [worker for worker in self._workers if not self._hangs(worker)]:
             has_news = worker.job is None or worker.pipe in ready  # one that starts or waits has none to send
@@ -369,8 +372,8 @@ def _share_threads(workers: int) -> Iterator[None]:
 def _run_worker(pipe: Connection, parent: int) -> None:
     """Run the worker's loop: it sends None to request a job; a closed pipe means that the parent has ended.
 
-    It ends without Python's shutdown, which aborts where a model's thread is still inside compiled code, and with all
-    processes that it has started by `multiprocessing`.
+    It ends without Python's shutdown, which aborts where a model's thread is still inside compiled code, and ends the
+    processes that it has started by `multiprocessing`, unless it is killed.
     """
     end_with_parent(parent)
     signal.signal(signal.SIGTERM, _end_worker)
@@ -388,9 +391,13 @@ def _run_worker(pipe: Connection, parent: int) -> None:
     _end_worker()
 
 
-def _end_worker(*_: object) -> NoReturn:
+def _end_worker(number: int | None = None, frame: FrameType | None = None) -> NoReturn:
+    """End this process and those that it has started, by the signal if there is one."""
     for child in active_children():
         child.kill()
+    if number is not None:
+        signal.signal(number, signal.SIG_DFL)
+        os.kill(os.getpid(), number)
     os._exit(0)
 
 

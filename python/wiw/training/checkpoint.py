@@ -3,6 +3,7 @@
 
 from __future__ import annotations
 
+import errno
 import json
 import time
 from collections.abc import Callable, Mapping
@@ -170,4 +171,8 @@ class Checkpoint:
 
 def _is_of_machine(error: Exception) -> bool:
     """Return whether a file could not be read for a reason that says nothing of its content."""
-    return (isinstance(error, OSError) and error.errno is not None) or is_out_of_memory(error)
+    of_system = isinstance(error, OSError) and error.errno not in (
+        None,
+        errno.EINVAL,
+    )  # a place read from damaged bytes
+    return of_system or is_out_of_memory(error)

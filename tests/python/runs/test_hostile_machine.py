@@ -56,6 +56,15 @@ class Forking(LineAgent):
 
 
 @dataclass
+class Leaving(LineAgent):
+    """Its process is told to end at every decision, as by the machine's owner."""
+
+    def _decide(self, query: Any) -> Any:
+        os.kill(os.getpid(), signal.SIGTERM)
+        return super()._decide(query)
+
+
+@dataclass
 class Starting(LineAgent):
     """Starts processes: one that ends, and one that is left running, whose number it writes into a folder."""
 
@@ -114,6 +123,11 @@ def test_a_worker_that_is_killed_and_leaves_a_child_is_replaced(tmp_path: Path) 
         assert {row["status"] for row in log.episodes} == {"done"} and len(log.episodes) == 6
     finally:
         os.kill(int((tmp_path / "child").read_text()), signal.SIGKILL)
+
+
+def test_a_worker_that_is_told_to_end_is_named_by_the_signal(tmp_path: Path) -> None:
+    log = run_arms(LineTask(), {"a": Leaving()}, 2, out=tmp_path / "run", progress=False, workers=2, live=1)
+    assert all(re.search(r"died twice on this episode, last: SIGTERM", row["error"]) for row in log.episodes)
 
 
 def test_agents_may_start_processes_in_workers_which_end_with_these(tmp_path: Path) -> None:

@@ -3,6 +3,7 @@
 
 from __future__ import annotations
 
+import errno
 import fcntl
 import os
 import shutil
@@ -192,6 +193,21 @@ def test_shards_that_go_on_after_a_merge_are_shown_and_merged_again(merged, tmp_
     assert [each["shard"] for each in load_run(merged).store.info["merged"]] == ["1/3", "2/3", "3/3"]
     assert wiw.merge([merged], merged).complete and wiw.merge([merged], tmp_path / "other").stores == 3
     assert {path.name for path in merged.iterdir()} <= {"1", "2", "3", "run.sqlite", "run.lock"}
+
+
+def test_a_merged_run_has_the_episodes_of_shards_that_are_gone(merged, tmp_path):
+    ended = len(load_run(merged).episodes)
+    shutil.rmtree(merged / "1")
+    assert wiw.status(merged).ended == ended == wiw.merge([merged], tmp_path / "copy").ended
+
+
+def test_a_merge_that_cannot_be_written_says_that_nothing_is_lost(merged, tmp_path, monkeypatch):
+    def fill(*_):
+        raise OSError(errno.EDQUOT, "Disk quota exceeded")
+
+    monkeypatch.setattr(scratch.shutil, "copyfile", fill)
+    with pytest.raises(FileError, match=r"the merged run cannot be written .*stores that were merged are as they were"):
+        wiw.merge([merged], tmp_path / "copy")
 
 
 def test_a_merged_run_that_was_resumed_is_not_replaced(merged):
