@@ -171,8 +171,6 @@ class Checkpoint:
 
 def _is_of_machine(error: Exception) -> bool:
     """Return whether a file could not be read for a reason that says nothing of its content."""
-    of_system = isinstance(error, OSError) and error.errno not in (
-        None,
-        errno.EINVAL,
-    )  # a place read from damaged bytes
+    # EINVAL is of a place in the file that was read from damaged bytes.
+    of_system = isinstance(error, OSError) and error.errno not in (None, errno.EINVAL)
     return of_system or is_out_of_memory(error)

@@ -444,16 +444,18 @@ def test_an_array_of_slurm_jobs(tmp_path, slurm, capsys):
     assert "job 70_0" in json.dumps(main(["status", str(out)]) or capsys.readouterr().out)
 
 
-STATES = "JobID|State|NodeList\n100_0|FAILED|n\n100_1|COMPLETED|n\n300_0|RUNNING|n\n300_1|COMPLETED|n\n"
-"""What `sacct` says; not what became of 200_0."""
+STATES = (
+    "JobID|State|NodeList\n100_0|FAILED|n\n100_1|COMPLETED|n\n300_0|RUNNING|n\n300_1|COMPLETED|n\n400_0|PREEMPTED|n\n"
+)
+"""What `sacct` says; not what became of 200_0. 400_0 may be requeued."""
 
 
 @pytest.mark.parametrize(
     ("answer", "canceled"),
     [
-        ("", ["200_0", "300_0"]),
-        ("scancel: error: Kill job error on job id 200: Invalid job id specified", ["300_0"]),
-        ("scancel: error: Kill job error on job id 200: Job/step already completing or completed", ["300_0"]),
+        ("", ["200_0", "300_0", "400_0"]),
+        ("scancel: error: Kill job error on job id 200: Invalid job id specified", ["300_0", "400_0"]),
+        ("scancel: error: Kill job error on job id 200: Job/step already completing or completed", ["300_0", "400_0"]),
     ],
 )
 def test_jobs_that_slurm_has_forgotten_keep_no_other_from_being_cancelled(tmp_path, slurm, answer, canceled):
@@ -466,11 +468,12 @@ def test_jobs_that_slurm_has_forgotten_keep_no_other_from_being_cancelled(tmp_pa
     )
     submitit.SlurmJob.watcher.clear()
     jobs = [
-        {"cluster": "slurm", "id": name, "arguments": ["run"]} for name in ("100_0", "100_1", "200_0", "300_0", "300_1")
+        {"cluster": "slurm", "id": name, "arguments": ["run"]}
+        for name in ("100_0", "100_1", "200_0", "300_0", "300_1", "400_0")
     ]
     (tmp_path / "jobs.json").write_text(json.dumps(jobs))
     assert [job.id for job in cancel(tmp_path)] == canceled
-    assert (slurm / "cancelled").read_text() == ("" if answer else "['200']") + "['300']"
+    assert (slurm / "cancelled").read_text() == ("" if answer else "['200']") + "['300']['400']"
     submitit.SlurmJob.watcher.clear()
 
 
