@@ -9,7 +9,7 @@ import warnings
 from collections import Counter
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
-from functools import cache, reduce
+from functools import cache
 from typing import Any
 
 from wiw.analysis.breakdowns import (
@@ -474,17 +474,16 @@ def split_outcomes(
     errors = dict.fromkeys(arms, 0)
     for outcome in outcomes:
         if outcome["status"] == "done":
-            measured = {name: math.nan if value is None else value for name, value in outcome["metrics"].items()}
-            metrics = reduce(_add_metric, known, measured)
+            metrics: Mapping[str, float] = {
+                name: math.nan if value is None else value for name, value in outcome["metrics"].items()
+            }
+            for metric in known:
+                metrics = metric.add_to(metrics)
             scene = strip_edits(outcome["scene"])
             done[outcome["arm"]][outcome["episode"]] = {**outcome, "scene": scene, "metrics": metrics}
         else:
             errors[outcome["arm"]] += 1
     return done, errors
-
-
-def _add_metric(metrics: Mapping[str, float], metric: Metric) -> Mapping[str, float]:
-    return metric.add_to(metrics)
 
 
 def find_cause(arm: str, outcomes: Sequence[Mapping[str, Any]]) -> str:
