@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 from scipy import special
 
-from wiw.analysis.intervals import Array, Interval, Kind, p_value_of_sums, sum_by_cluster
+from wiw.analysis.intervals import Array, Interval, Kind, draw_in_blocks, p_value_of_sums, sum_by_cluster
 
 FEWEST_SCENES = 8
 """Scenes from which on they are flipped: with fewer, too few flips are possible for a small p."""
@@ -27,8 +27,6 @@ LARGEST_SUM, MOST_WORK = 1_000_000, 200_000_000
 """Sum of sizes, and its product with their number, up to which whole numbers have the probability of each sum computed:
 beyond it takes too much memory, or seconds.
 """
-BLOCK = 2_000_000
-"""Signs that are drawn at a time."""
 
 
 def find_p_value(
@@ -78,10 +76,8 @@ def flip_signs(sums: Array, seed: int = 0) -> float:
         for size in sizes:
             totals = np.concatenate([totals + size, totals - size])
         return float(np.mean(np.abs(totals) >= seen))
-    rng, count, rows = np.random.Generator(np.random.Philox(key=seed)), 0, max(1, BLOCK // len(sizes))
-    for begin in range(0, DRAWS, rows):
-        signs = rng.integers(2, size=(min(rows, DRAWS - begin), len(sizes))) * 2 - 1
-        count += int(np.sum(np.abs(signs @ sizes) >= seen))
+    blocks = draw_in_blocks(seed, 2, DRAWS, len(sizes))
+    count = sum(int(np.sum(np.abs((coins * 2 - 1) @ sizes) >= seen)) for coins in blocks)
     return (1 + count) / (1 + DRAWS)
 
 

@@ -10,6 +10,7 @@ scenes it is too narrow. `docs/statistics.md` has measured coverage.
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from typing import Literal
 
 import numpy as np
@@ -32,7 +33,7 @@ LENGTH_WEIGHT = 2
 """Made-up episodes that steady lengths, one at either end of their range, each worth as many real ones as the design
 effect (as Agresti and Coull, 1998, steady proportions with four)."""
 BLOCK = 2_000_000
-"""Clusters of the bootstrap that are drawn at a time."""
+"""Random numbers that are drawn at a time."""
 HALVINGS = 40
 """Steps of the bisection for an end of Tango's interval: to 2e-12."""
 
@@ -292,17 +293,23 @@ def clustered_bootstrap(
     sums, counts = sum_by_cluster(np.asarray(values, np.float64), np.asarray(clusters))
     if len(sums) < 2:
         raise ArgumentError(f"clustered_bootstrap: expected at least 2 clusters, got {len(sums)}")
-    rng, rows = np.random.Generator(np.random.Philox(key=seed)), max(1, BLOCK // len(sums))
-    blocks = []
-    for begin in range(0, resamples, rows):
-        draws = rng.integers(len(sums), size=(min(rows, resamples - begin), len(sums)))
-        blocks.append(sums[draws].sum(1) / counts[draws].sum(1))
-    means = np.concatenate(blocks)
+    blocks = draw_in_blocks(seed, len(sums), resamples, len(sums))
+    means = np.concatenate([sums[draws].sum(1) / counts[draws].sum(1) for draws in blocks])
     tails = np.array([0.5 - confidence / 2, 0.5 + confidence / 2])
     if method == "bca":
         tails = _bca_levels(means, sums, counts, tails)
     low, high = np.quantile(means, tails)
     return float(low), float(high)
+
+
+def draw_in_blocks(seed: int, end: int, rows: int, columns: int) -> Iterator[NDArray[np.int64]]:
+    """Yield whole numbers from 0 to `end` - 1, int64 [rows, columns] in all, a block of rows at a time.
+
+    They are those of a single draw, which may take too much memory.
+    """
+    rng, most = np.random.Generator(np.random.Philox(key=seed)), max(1, BLOCK // columns)
+    for begin in range(0, rows, most):
+        yield rng.integers(end, size=(min(most, rows - begin), columns))
 
 
 def sum_by_cluster(values: Array, clusters: NDArray[np.generic]) -> tuple[Array, Array]:
