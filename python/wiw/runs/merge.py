@@ -8,7 +8,6 @@ and `calls` as far as they depend on which episodes ran together, and what `info
 from __future__ import annotations
 
 import math
-import shutil
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import ExitStack, contextmanager
 from dataclasses import asdict, dataclass
@@ -18,7 +17,6 @@ from typing import Any
 
 from wiw.errors import Error, FileError, StoreError
 from wiw.file_systems import find_network
-from wiw.files import atomic_file
 from wiw.registry import POLICIES, TASKS, WORLD_MODELS
 from wiw.runs.execute import draw_pictures, read_recipes
 from wiw.runs.pictures import drop_spare_pictures
@@ -27,7 +25,7 @@ from wiw.runs.run import find_stores, list_marks
 from wiw.runs.scratch import make_local_folder
 from wiw.runs.store import RunStore
 from wiw.runs.store_file import lock_store, store_path
-from wiw.runs.store_log import remove_log
+from wiw.runs.store_log import replace_store_file
 from wiw.runs.verify import list_differences, read_facts
 from wiw.world_models.base import Requirements
 
@@ -153,9 +151,7 @@ def _choose_place(out: str | Path, parts: Sequence[RunStore], local: Path) -> It
             locks.callback(lock_store(path).close)
         _require_replaceable(out, parts)
         yield new
-        with atomic_file(path) as draft:
-            shutil.copyfile(store_path(new), draft)
-            remove_log(path)  # else SQLite would apply it to the new file
+        replace_store_file(path, store_path(new))
 
 
 def _require_replaceable(out: str | Path, parts: Sequence[RunStore]) -> None:

@@ -11,7 +11,6 @@ from __future__ import annotations
 
 import logging
 import os
-import shutil
 import sqlite3
 import tempfile
 import time
@@ -22,9 +21,8 @@ from pathlib import Path
 from typing import NamedTuple
 
 from wiw.errors import FileError, StoreError
-from wiw.files import atomic_file
 from wiw.runs.faults import explain_faults, write_resume_command
-from wiw.runs.store_log import remove_log
+from wiw.runs.store_log import replace_store_file
 
 PERIOD = 60.0
 """Seconds between two copies."""
@@ -125,9 +123,7 @@ class ScratchCopy:
         with explain_faults(draft, self.home):
             write_whole(connection, draft)
         try:
-            with atomic_file(self.home) as file:
-                shutil.copyfile(draft, file)
-                remove_log(self.home)  # else SQLite would apply it to the copy
+            replace_store_file(self.home, draft)
         except (FileError, StoreError) as error:
             raise type(error)(
                 f"{error}. Everything recorded is in {self.path}; once the cause is fixed, `{self.resume_command}` "

@@ -361,7 +361,7 @@ class RunStore:
         return self.path if self._copy is None else self._copy.home
 
     @property
-    def left(self) -> Path | None:
+    def local_file(self) -> Path | None:
         """The file on a local disk, of a store that is written there; None once it is copied home and removed."""
         return None if self._copy is None or not self._copy.path.is_file() else self._copy.path
 
@@ -374,7 +374,7 @@ class RunStore:
 
     @property
     def _session(self) -> dict[str, Any]:
-        """What `begin_session` has stored; empty if no episode was run yet."""
+        """Values that `begin_session` has stored; empty if no episode was run yet."""
         session = self.info.get("session")
         return session if isinstance(session, dict) else {}
 
@@ -895,11 +895,11 @@ def leave_resumable(begun: RunStore) -> Iterator[None]:
     try:
         yield
     except Exception as error:
-        with suppress(StoreError), RunStore.read(begun.left or begun.home) as store:
-            if begun.left is None and not store.has_rows():  # home may lack rows that are left on the local disk
+        with suppress(StoreError), RunStore.read(begun.local_file or begun.home) as store:
+            if begun.local_file is None and not store.has_rows():  # home may lack rows that are left on the local disk
                 remove_store(begun.home)
             elif store.info["task"] is not None:  # else it was begun with objects, and no command can resume it
-                place = "" if begun.left is None else f" in {begun.left}"
+                place = "" if begun.local_file is None else f" in {begun.local_file}"
                 note = f"Everything recorded is kept{place}. Once the cause is fixed:  {command}"
                 vars(error).setdefault("__notes__", []).append(note)  # as `add_note` of Python 3.11 does
         raise

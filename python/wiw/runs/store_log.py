@@ -3,12 +3,14 @@
 
 from __future__ import annotations
 
+import shutil
 import sqlite3
 from contextlib import closing, suppress
 from pathlib import Path
 
 from wiw.errors import StoreError
 from wiw.file_systems import find_network
+from wiw.files import atomic_file
 from wiw.runs.faults import explain_faults
 
 
@@ -51,6 +53,18 @@ def remove_log(path: Path) -> None:
         raise StoreError(_describe_use(path))
     for end in ("-wal", "-shm"):
         path.with_name(path.name + end).unlink(missing_ok=True)
+
+
+def replace_store_file(path: Path, source: Path) -> None:
+    """Replace a store's file by a copy of another one, atomically and without the log of the earlier file.
+
+    Raises:
+        StoreError: the earlier file has transactions in its log, which would be lost.
+        FileError: it cannot be written.
+    """
+    with atomic_file(path) as draft:
+        shutil.copyfile(source, draft)
+        remove_log(path)  # else SQLite would apply it to the copy
 
 
 def _describe_use(path: Path) -> str:

@@ -398,7 +398,7 @@ class _Failure:
     is_passing: bool = True
     """Whether it may succeed if it is sent again."""
     hint: str = ""
-    """What to do about it, for the message."""
+    """Remedy, for the message."""
 
 
 @dataclass

@@ -20,7 +20,7 @@ from fakes import LineTask
 import wiw
 from wiw.cli.stop import Terminated, stoppable
 from wiw.errors import FileError, StoreError
-from wiw.runs import scratch
+from wiw.runs import scratch, store_log
 from wiw.runs.rows import OutcomeRow
 from wiw.runs.status import _read_time
 from wiw.runs.store import RunStore, find_resume_command, leave_resumable
@@ -53,7 +53,7 @@ def full_home() -> Iterator[None]:
         raise OSError(errno.EDQUOT, os.strerror(errno.EDQUOT))
 
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(scratch.shutil, "copyfile", fill)
+        patch.setattr(store_log.shutil, "copyfile", fill)
         yield
 
 

@@ -22,7 +22,7 @@ import wiw
 from wiw import file_systems
 from wiw.cli import main
 from wiw.errors import ArgumentError, FileError, StoreError
-from wiw.runs import scratch, store_file
+from wiw.runs import scratch, store_file, store_log
 from wiw.runs.frame_scores import FrameScores
 from wiw.runs.judges import JudgedRow, JudgeRecord
 from wiw.runs.recipes import AgentRecipe, TaskRecipe
@@ -205,7 +205,7 @@ def test_a_merge_that_cannot_be_written_says_that_nothing_is_lost(merged, tmp_pa
     def fill(*_):
         raise OSError(errno.EDQUOT, "Disk quota exceeded")
 
-    monkeypatch.setattr(scratch.shutil, "copyfile", fill)
+    monkeypatch.setattr(store_log.shutil, "copyfile", fill)
     with pytest.raises(FileError, match=r"the merged run cannot be written .*stores that were merged are as they were"):
         wiw.merge([merged], tmp_path / "copy")
 
@@ -251,7 +251,7 @@ def test_a_merged_run_that_is_in_use_or_cannot_be_written_stays(merged, monkeypa
     def fail(path):
         raise OSError(28, "No space left on device")
 
-    monkeypatch.setattr("wiw.runs.merge.remove_log", fail)  # the last step before the file is replaced
+    monkeypatch.setattr("wiw.runs.store_log.remove_log", fail)  # the last step before the file is replaced
     with pytest.raises(FileError, match="No space left"):
         wiw.merge([merged], merged)
     assert read_rows(merged) == before
@@ -480,7 +480,7 @@ def test_a_copy_that_cannot_be_made_leaves_the_store_on_the_disk(tmp_path, monke
 
     with monkeypatch.context() as patch:
         begin(tmp_path / "run", 2, scratch=tmp_path / "local").close()
-        patch.setattr(scratch.shutil, "copyfile", fill)
+        patch.setattr(store_log.shutil, "copyfile", fill)
         with pytest.raises(FileError, match="No space left"):
             begin(tmp_path / "run", 2, scratch=tmp_path / "local", resume=True)
     left = list((tmp_path / "local").rglob("run.sqlite"))

@@ -494,7 +494,7 @@ def test_an_interrupted_series_goes_on(blocks, monkeypatch):
 
 
 def test_a_scene_alone_has_as_many_episodes_as_questions(monkeypatch, tmp_path):
-    """Those of a house from a file come to an end, too."""
+    """The questions of a house from a file come to an end, too."""
     monkeypatch.setattr("wiw.tasks.aeqa.resolve", lambda spec: [SCENE])
     monkeypatch.setattr(AEQA, "is_balanced", False)
     found = tuple(replace(make_answerable(SCENE), text=text) for text in ("one?", "two?", "three?"))
