@@ -112,6 +112,7 @@ def study_errors(
     size: Annotated[tuple[int, int] | None, arg(metavar="H W")] = None,
     fidelity_share: Annotated[float | None, arg(metavar="SHARE")] = None,
     lpips: Annotated[str | None, arg(metavar="auto|DIR")] = None,
+    distances: Annotated[Path | None, arg(metavar="DIR")] = None,
     read_only: bool = False,
     workers: Annotated[int, arg(metavar="N")] = 1,
 ) -> int:
@@ -122,6 +123,8 @@ def study_errors(
     $ wiw study errors --tasks imagenav --preset foresight --tier beyond --size 144 256
     $ wiw study errors --workers 16 --lpips auto               # all tasks, errors and doses: hours
     $ wiw study errors --tasks ar --read-only                  # tables and page of everything run so far
+    $ wiw study errors --tasks ar --episodes 8 --fidelity-share 1 --lpips auto --out runs/lpips
+    $ wiw study errors --tasks ar --read-only --distances runs/lpips    # success of one study, distances of the other
 
     The errors concern looks (blur, noise, tint, resolution), flicker, control (scale, direction, lag, drift, ignored)
     and content (missing, moved, invented, open); `wiw list errors` explains each one and the unit of its doses. All
@@ -150,6 +153,8 @@ def study_errors(
             only looks at 64x128, so a smaller size is enough for it and several times faster.
         fidelity_share: Share of the decisions at which regret and distances are measured. Default: 0.25.
         lpips: Weights of LPIPS (see `wiw run --lpips`). Default: none, 1 - SSIM instead.
+        distances: Folder of another study of the same tasks by the same agent, often of fewer episodes; show its
+            distances and regret with the success of this one. Default: this one's own.
         read_only: Run nothing, and show what exists.
         workers: Number of processes; results do not depend on it.
     """
@@ -180,10 +185,10 @@ def study_errors(
     settings = replace(SMALL if small else FULL, **changes)
     folder = _choose_folder(out, "errors", small)
     if read_only:
-        found = read_errors(folder, settings)
+        found = read_errors(folder, settings, distances=distances)
     else:
         with announce_resume(), Bars() as bars:
-            found = study(folder, settings, workers=workers, lpips=lpips, watch=bars.show)
+            found = study(folder, settings, workers=workers, lpips=lpips, distances=distances, watch=bars.show)
     found.summary()
     for path in found.save():
         print(path)

@@ -145,6 +145,7 @@ def study_errors(
     *,
     workers: int = 1,
     lpips: str | Path | None = None,
+    distances: str | Path | None = None,
     watch: Watch = lambda *_: None,
 ) -> ErrorStudy:
     """Run the oracle with errors of known doses on the same episodes, and measure what each costs.
@@ -162,11 +163,12 @@ def study_errors(
         settings: tasks, errors, doses and episodes; `wiw.studies.errors.SMALL` is the small version.
         workers: number of processes; results do not depend on it.
         lpips: folder of the weights of LPIPS, or "auto", to measure it besides PSNR and SSIM.
+        distances: folder of another study, from which to take distances and regret, as in `read_errors`.
         watch: called with progress.
 
     Raises:
         ArgumentError: a number out of range, or a policy that does not fit a task.
-        StoreError: the folder holds a study with other settings.
+        StoreError: the folder holds a study with other settings, or `distances` one of another agent.
         WeightsError: those of LPIPS are missing.
     """
     if lpips is not None:
@@ -174,7 +176,8 @@ def study_errors(
     folder = Path(out)
     tables = []
     for task in settings.tasks:
-        table = _read_task(task, settings, _run_task(task, settings, folder / task, workers, lpips, watch))
+        parts = _run_task(task, settings, folder / task, workers, lpips, watch)
+        table = _read_task(task, settings, parts, _list_measured(task, parts, distances))
         if table is None:
             raise StoreError(
                 f"errors: nothing can be compared in {folder / task}: no episode of {FLOOR}, {CEILING} or of any arm "
@@ -184,19 +187,27 @@ def study_errors(
     return ErrorStudy(tuple(tables), settings, folder)
 
 
-def read_errors(out: str | Path, settings: ErrorSettings = FULL) -> ErrorStudy:
+def read_errors(out: str | Path, settings: ErrorSettings = FULL, *, distances: str | Path | None = None) -> ErrorStudy:
     """Return the study in a folder, as far as it has progressed, without running anything.
+
+    Success needs many episodes, but distances, above all LPIPS, are slow to measure and are known from few. Measure
+    them in a second study of the same episodes, with a `fidelity_share` of 1, and name it in `distances`.
 
     Args:
         out: folder of the study.
         settings: tasks, kinds and doses to show; everything else is as the study was started. Tasks in which no arm
             with an error has finished an episode are left out.
+        distances: folder of another study of the same tasks by the same agent, from which distances and regret are
+            taken instead.
 
     Raises:
-        StoreError: this is so for all tasks.
+        StoreError: no task has such an arm, or `distances` is a study of another agent or lacks a task.
     """
     folder = Path(out)
-    tables = [_read_task(task, settings, _list_parts(folder / task)) for task in settings.tasks]
+    tables = []
+    for task in settings.tasks:
+        parts = _list_parts(folder / task)
+        tables.append(_read_task(task, settings, parts, _list_measured(task, parts, distances) if parts else []))
     found = tuple(table for table in tables if table is not None)
     if not found:
         raise StoreError(
@@ -232,6 +243,28 @@ def _recall_settings(tasks: Sequence[str], settings: ErrorSettings, folder: Path
 def _list_parts(folder: Path) -> list[Path]:
     """Return the existing folders of a task's runs."""
     return sorted(path.parent for path in folder.glob("shard-*-of-*/run.sqlite"))
+
+
+def _list_measured(task: str, parts: Sequence[Path], distances: str | Path | None) -> list[Path]:
+    """Return the folders of the runs that distances are taken from: a task's own, or those of another study."""
+    if distances is None:
+        return list(parts)
+    measured = _list_parts(Path(distances) / task)
+    if not measured:
+        raise StoreError(f"errors: {distances} has no run of {task}; name the folder of a study of this task")
+    with RunStore.read(parts[0]) as own, RunStore.read(measured[0]) as other:
+        for what, mine, theirs in (
+            ("benchmark version", own.info["benchmark"], other.info["benchmark"]),
+            ("task", own.info["task"], other.info["task"]),
+            ("agent", own.info["agents"][CEILING], other.info["agents"][CEILING]),
+        ):
+            if mine != theirs:
+                raise StoreError(
+                    f"errors: expected distances of the same {what} as in {parts[0].parent}, {mine}, got {theirs} in "
+                    f"{measured[0].parent}; run `wiw study errors` there with the same settings, but for --episodes, "
+                    "--fidelity-share and --lpips"
+                )
+    return measured
 
 
 def _run_task(
@@ -309,24 +342,28 @@ def _size_option(settings: ErrorSettings) -> dict[str, Any]:
     return {} if settings.size is None else {"size": list(settings.size)}
 
 
-def _read_task(task: str, settings: ErrorSettings, parts: Sequence[Path]) -> ErrorTable | None:
+def _read_task(
+    task: str, settings: ErrorSettings, parts: Sequence[Path], measured: Sequence[Path]
+) -> ErrorTable | None:
     """Return the numbers of a task from its runs, which may be unfinished.
 
-    None until an episode has been scored without imagination, with true futures and in an arm with an error.
+    Success is taken from the runs in `parts`, distances and regret from those in `measured`, mostly the same. None
+    until an episode has been scored without imagination, with true futures and in an arm with an error.
     """
     with ExitStack() as stack:
-        logs = [load_run(path) for path in parts]
-        for log in logs:
+        logs = {path: load_run(path) for path in dict.fromkeys((*parts, *measured))}
+        for log in logs.values():
             stack.callback(log.close)
-        scored = {row["arm"] for log in logs for row in log.store.outcomes() if row["status"] == "done"}
+        outcomes = [row for path in parts for row in logs[path].store.outcomes()]
+        scored = {row["arm"] for row in outcomes if row["status"] == "done"}
         shown = settings.list_arms(task)
         if not {FLOOR, CEILING} <= scored or scored.isdisjoint(shown):
             return None
         return summarise_errors(
             task,
-            logs[0].store.info["agents"][CEILING]["policy"],
-            [row for log in logs for row in log.store.outcomes()],
-            (row for log in logs for row in log.store.decisions()),
+            logs[parts[0]].store.info["agents"][CEILING]["policy"],
+            outcomes,
+            (row for path in measured for row in logs[path].store.decisions()),
             shown,
             settings.list_left_out(task),
             settings.seed,

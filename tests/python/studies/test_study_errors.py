@@ -308,3 +308,33 @@ def test_a_study_goes_on_where_it_stopped_and_gains_kinds(two_rooms: str, tmp_pa
     assert "no episode of an arm with an error so far" in capsys.readouterr().err
     numbers = json.loads((tmp_path / "study" / "errors.json").read_text())
     assert np.isfinite(numbers["tasks"][0]["lines"][0]["outcome"]["value"])
+
+
+def test_distances_of_few_episodes_go_with_the_success_of_many(two_rooms: str, tmp_path: Path, capsys) -> None:
+    many = ErrorSettings(
+        tasks=("imagenav",), kinds=("blur",), doses=1, episodes=2, scenes=two_rooms, size=(64, 128), fidelity_share=0.01
+    )
+    few = replace(many, episodes=1, fidelity_share=1.0)
+    (own,) = study_errors(tmp_path / "many", many).tables
+    (measured,) = study_errors(tmp_path / "few", few).tables
+    found = read_errors(tmp_path / "many", many, distances=tmp_path / "few")
+    assert found.to_json() == study_errors(tmp_path / "many", many, distances=tmp_path / "few").to_json()
+    (both,) = found.tables
+    assert not own.lines[0].measures and measured.episodes == 1 and both.episodes == 2
+    assert str(both.lines[0].measures) == str(measured.lines[0].measures)  # as text, since intervals of one are NaN
+    assert both.lines[0].measures["1 - SSIM"].n == 1
+    assert both.lines[0].outcome == own.lines[0].outcome and both.references == own.references
+    assert {cost.family for cost in both.costs} == {"looks"} and own.costs == ()
+    folders = ["--out", str(tmp_path / "many"), "--distances", str(tmp_path / "few")]
+    arguments = ["study", "errors", "--tasks", "imagenav", "--kinds", "blur", "--doses", "1", *folders, "--read-only"]
+    assert main(arguments) == 0
+    assert "Errors of looks cost" in " ".join(capsys.readouterr().out.split())
+
+    study_errors(tmp_path / "larger", replace(few, size=(72, 144)))
+    with pytest.raises(StoreError, match=r"expected distances of the same agent as in .*many.*--fidelity-share"):
+        read_errors(tmp_path / "many", many, distances=tmp_path / "larger")
+    study_errors(tmp_path / "seeded", replace(few, seed=1))
+    with pytest.raises(StoreError, match="expected distances of the same task as in"):
+        read_errors(tmp_path / "many", many, distances=tmp_path / "seeded")
+    with pytest.raises(StoreError, match="has no run of imagenav; name the folder of a study"):
+        read_errors(tmp_path / "many", many, distances=tmp_path)
