@@ -117,11 +117,11 @@ class LineTask(Task):
 class PictureTask(LineTask):
     """Goals whose place is not known, as in lists of questions; their pictures lie in a folder."""
 
-    folder: str = "/data"
+    picture: str = "/data/goals/0.png"
 
     def episodes(self, count: int) -> list[Episode]:
         unknown: dict[str, Any] = {"goal_position": (math.nan,) * 3}
-        info = {"goal_image": f"{self.folder}/goals/0.png"}
+        info = {"goal_image": self.picture}
         return [replace(each, **unknown, info=info) for each in super().episodes(count)]
 
 

@@ -7,7 +7,6 @@ and `calls` as far as they depend on which episodes ran together, and what `info
 
 from __future__ import annotations
 
-import math
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import ExitStack, contextmanager
 from dataclasses import asdict, dataclass
@@ -20,7 +19,7 @@ from wiw.file_systems import find_network
 from wiw.registry import POLICIES, TASKS, WORLD_MODELS
 from wiw.runs.execute import draw_pictures, read_recipes
 from wiw.runs.pictures import drop_spare_pictures
-from wiw.runs.rows import to_json
+from wiw.runs.rows import drop_folders, to_json
 from wiw.runs.run import find_stores, list_marks
 from wiw.runs.scratch import make_local_folder
 from wiw.runs.store import RunStore
@@ -215,10 +214,11 @@ def _require_one_stop(stores: Sequence[RunStore]) -> None:
 def _read_manifest(store: RunStore) -> dict[str, Any]:
     info = store.info
     episodes = [{**asdict(episode), "geodesic": None} for episode in store.episodes()]  # may be measured in one alone
+    own = drop_folders({"task": store.config["task"], "episode": episodes})  # data may lie elsewhere on another machine
     limits = {name: info["limits"].get(name) for name in ("fidelity", "fidelity_share", "lpips")}
     kept = {name: info.get(name) for name in ("sources", "scenes", "until")}
     versions = {"wiw": store.wiw_version, "benchmark": store.benchmark}
-    return {**versions, **store.config, "salt": store.salt, **limits, **kept, "episode": episodes}
+    return {**versions, **store.config, "salt": store.salt, **limits, **kept, **own}
 
 
 def _compare(first: Any, second: Any, place: str) -> Iterator[tuple[str, Any, Any]]:
@@ -230,13 +230,8 @@ def _compare(first: Any, second: Any, place: str) -> Iterator[tuple[str, Any, An
     elif isinstance(first, list | tuple) and isinstance(second, list | tuple) and len(first) == len(second):
         for index, (one, other) in enumerate(zip(first, second, strict=True)):
             yield from _compare(one, other, f"{place}[{index}]")
-    elif first != second and not _are_unknown(first, second):
+    elif first != second:
         yield place, first, second
-
-
-def _are_unknown(*values: Any) -> bool:
-    """Return whether all values are NaN, such as the place of a goal that nobody knows."""
-    return all(isinstance(each, float) and math.isnan(each) for each in values)
 
 
 def _show(value: Any, most: int = 120) -> str:

@@ -7,6 +7,7 @@ import json
 import math
 from collections.abc import Iterator, Mapping
 from dataclasses import asdict, dataclass
+from pathlib import Path
 from typing import Any
 
 import cv2
@@ -91,6 +92,21 @@ def _make_plain(value: Any) -> Any:
         return {str(key): _make_plain(item) for key, item in value.items()}
     if isinstance(value, list | tuple):
         return [_make_plain(item) for item in value]
+    return value
+
+
+def drop_folders(value: Any) -> Any:
+    """Return a plain value as it is compared between machines: an absolute path by its last part, and NaN, which
+    stands for an unknown place, as None.
+    """
+    if isinstance(value, Mapping):
+        return {name: drop_folders(each) for name, each in value.items()}
+    if isinstance(value, list | tuple):
+        return [drop_folders(each) for each in value]
+    if isinstance(value, float) and math.isnan(value):
+        return None
+    if isinstance(value, str) and "/" in value and Path(value).is_absolute():
+        return Path(value).name
     return value
 
 

@@ -28,7 +28,7 @@ from wiw.analysis.utility import Utility
 from wiw.errors import ArgumentError, StoreError
 from wiw.loop.config import AgentConfig
 from wiw.report.tables import SummaryTable
-from wiw.runs.rows import to_json
+from wiw.runs.rows import drop_folders, to_json
 from wiw.studies.run_log import RunLog, load_run
 from wiw.types import Episode
 
@@ -208,7 +208,7 @@ def require_comparable(
         _refuse(a, b, "version of the benchmark", versions, advice)
     ours, theirs = a.store.config, b.store.config
     for name in dict.fromkeys([*ours["task"], *theirs["task"]]):
-        values = [_simplify_value(config["task"].get(name)) for config in (ours, theirs)]
+        values = [drop_folders(config["task"].get(name)) for config in (ours, theirs)]
         if values[0] != values[1] and name not in ("judge", *BUDGET_RULES):
             _refuse(a, b, f"task.{name}", values, "rerun one of them with the other's task, scenes and preset")
     if not unlike_budgets and (differing := list_unlike_budgets(a, b, pairs)):
@@ -269,25 +269,12 @@ def _require_same_episode(a: RunLog, b: RunLog, index: int, pair: tuple[Episode,
     described = [asdict(episode) for episode in pair]
     lengths = [float(one.pop("geodesic")) for one in described]
     for name in described[0]:
-        values = [_simplify_value(one[name]) for one in described]
+        values = [drop_folders(one[name]) for one in described]
         if values[0] != values[1]:
             _refuse(a, b, f"episode {index}: {name}", values, "they ran on different episodes; rerun one of them")
     if all(map(math.isfinite, lengths)) and abs(lengths[0] - lengths[1]) > LENGTH_TOLERANCE:
         advice = "the scene itself has changed (its file or its navigation mesh); rerun one of them"
         _refuse(a, b, f"episode {index}: shortest path", lengths, advice)
-
-
-def _simplify_value(value: Any) -> Any:
-    """Return a value as it is compared: a path by its last part, as scenes lie elsewhere on another machine."""
-    if isinstance(value, Mapping):
-        return {name: _simplify_value(each) for name, each in value.items()}
-    if isinstance(value, list | tuple):
-        return [_simplify_value(each) for each in value]
-    if isinstance(value, float) and math.isnan(value):  # an unknown goal is equal to another one
-        return None
-    if isinstance(value, str) and "/" in value and Path(value).is_absolute():
-        return Path(value).name
-    return value
 
 
 def _refuse(a: RunLog, b: RunLog, field: str, values: Sequence[Any], advice: str) -> None:

@@ -107,11 +107,15 @@ def test_merged_shards_equal_the_run_of_one_process(tmp_path):
 
 
 def test_shards_of_episodes_whose_goal_is_not_known_are_merged(tmp_path):
+    """Their pictures may lie in another folder on each machine, but have the same names."""
     shards = []
-    for shard in ("1/2", "2/2"):
-        shards.append(tmp_path / shard[0])
-        run_arms(PictureTask(), {"a": LineAgent()}, 4, out=shards[-1], shard=shard, salt="", progress=False)
-    assert wiw.merge(shards, tmp_path / "merged").complete
+    for shard, name in (("1/2", "0.png"), ("2/2", "0.png"), ("2/2", "1.png")):
+        shards.append(tmp_path / str(len(shards)))
+        task = PictureTask(picture=f"/machine{len(shards)}/goals/{name}")
+        run_arms(task, {"a": LineAgent()}, 4, out=shards[-1], shard=shard, salt="", progress=False)
+    assert wiw.merge(shards[:2], tmp_path / "merged").complete
+    with pytest.raises(StoreError, match=r'episode\[0\]\.info\.goal_image: "0.png" and "1.png"'):
+        wiw.merge([shards[0], shards[2]], tmp_path / "other")
 
 
 def test_a_merged_run_is_of_the_version_that_ran_its_parts(tmp_path):

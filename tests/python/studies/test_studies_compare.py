@@ -174,7 +174,7 @@ def test_scenes_may_lie_elsewhere(runs, tmp_path):
 def test_goals_may_be_unknown_and_their_pictures_lie_elsewhere(tmp_path):
     copies = [tmp_path / name for name in ("here", "there")]
     for copy, folder in zip(copies, ("/data", "/home/me/data"), strict=True):
-        run_arms(PictureTask(folder=folder), {"warp": LineAgent(0.5)}, 4, out=copy, progress=False)
+        run_arms(PictureTask(picture=f"{folder}/goals/0.png"), {"warp": LineAgent(0.5)}, 4, out=copy, progress=False)
     assert wiw.compare(*copies).difference("warp · there", "warp · here").estimate.n == 4
 
 
