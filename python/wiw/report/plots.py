@@ -552,9 +552,11 @@ def _measure_longest(texts: Sequence[str]) -> int:
 
 def _draw_legend(axes: Axes) -> None:
     texts = axes.get_legend_handles_labels()[1]
+    if not texts:
+        return
     longest = _measure_longest(texts)
     widest = 4 if longest < 11 else 2 if longest < 20 else 1  # columns that fit the drawing's width
-    columns = math.ceil(len(texts) / math.ceil(len(texts) / widest)) if texts else 1  # rows of about equal length
+    columns = math.ceil(len(texts) / math.ceil(len(texts) / widest))  # rows of about equal length
     broken = sum(text.count("\n") for text in texts)
     more = math.ceil(len(texts) / columns) + broken - LEGEND_ROWS
     if isinstance(figure := axes.figure, Figure):
