@@ -24,7 +24,7 @@
 namespace wiw::scene {
 namespace {
 
-constexpr int kImporterVersion = 7;  // raise it whenever the same file and options give another scene
+constexpr int kImporterVersion = 8;  // raise it whenever the same file and options give another scene
 
 /// What comes after indexes arrays by what the file says.
 void check_indices(const aiScene& file, const std::filesystem::path& path) {

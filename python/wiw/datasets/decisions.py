@@ -92,9 +92,11 @@ def load_decisions(path: str | Path) -> Decisions:
 
     Raises:
         DependencyError: pyarrow is not installed.
-        FileError: there is no such file, or it is damaged.
+        FileError: there is no such file, it is damaged, or it holds no decision.
     """
     file = _open(path)
+    if not len(file):
+        raise FileError(f"{path}: expected stored decisions, got a file without any")
     return join_decisions([_read_decision(file, index) for index in range(len(file))])
 
 

@@ -29,12 +29,18 @@ def save(path: str | Path, episodes: Sequence[Episode], task: str, **about: Any)
     """Write an episode file, gzipped if its name ends in .gz; `about` (generator, seed, ...) goes into its header.
 
     Raises:
+        ArgumentError: an episode has no start yet, or a number in its `info` is not finite.
         FileError: it cannot be written; a file that was there is as it was.
     """
     folder = Path(path).absolute().parent
     items = [_item(episode, folder) for episode in episodes]
     body = {"format": "wiw-episodes", "version": VERSION, "task": task, **about, "episodes": items}
-    text = json.dumps(body, indent=1, allow_nan=False).encode()
+    try:
+        text = json.dumps(body, indent=1, allow_nan=False).encode()
+    except ValueError as error:
+        raise ArgumentError(
+            f"{path}: expected episodes with starts, and with finite numbers in info: {error}"
+        ) from error
     with atomic_file(Path(path)) as draft:
         draft.write_bytes(gzip.compress(text, mtime=0) if str(path).endswith(".gz") else text)
 
@@ -74,7 +80,7 @@ def _scene(name: str, folder: Path, where: str) -> str:
         if len(named) != 1 or "/" not in name:
             raise ValueError("expected a single one, such as apartments:val/3")
         return named[0]
-    except (ArgumentError, ValueError, RuntimeError) as error:  # RuntimeError: "~" of a user who is not known
+    except (ArgumentError, ValueError) as error:
         raise FileError(f"{where}: scene '{name}': {error}") from error
 
 

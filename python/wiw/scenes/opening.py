@@ -15,7 +15,7 @@ from wiw.errors import ArgumentError, FileError
 from wiw.scenes import basis, isolated, store
 from wiw.scenes.apartments import apartment, apartment_table
 from wiw.scenes.scans import formats
-from wiw.scenes.specs import is_generated, parse_single
+from wiw.scenes.specs import blame_path, is_generated, parse_single
 
 Scene = _core.scene.Scene
 Folders = str | PathLike[str] | Sequence[str | PathLike[str]]
@@ -49,7 +49,8 @@ def load(
         path: the file; `~` is expanded.
         up: "y", "z", or None and "auto": by the file (COLLADA header; Y for glTF, OBJ and PLY; Z for scans and for
             names in HM3D's layout). The rule that was used is `scene.attributes["up"]`.
-        ceiling: height in metres above the floor at which to close a scene that is open above.
+        ceiling: height in metres above the floor at which to close a scene that is open above. Rooms of Replica and
+            scenes of scene datasets take none.
         cache: cache the imported scene on disk (`$WIW_CACHE` or `~/.cache/wiw`), to be mapped the next time.
         isolate: import in a separate process, so that a file that crashes the reader raises FileError here.
         limits: raises or lowers the import limits: file_bytes, triangles, nodes, texture_pixels, texture_bytes.
@@ -63,9 +64,10 @@ def load(
         ArgumentError: an option is out of its range.
         DependencyError: a scan's textures need a decoder that is not installed.
     """
-    file = Path(path).expanduser().absolute()  # the cache is shared by processes with other working folders
-    if not file.is_file():
-        raise FileError(f"{file}: no such file; expected a mesh or a Gazebo world")
+    with blame_path(path):
+        file = Path(path).expanduser().absolute()  # the cache is shared by processes with other working folders
+        if not file.is_file():
+            raise FileError(f"{file}: no such file; expected a mesh or a Gazebo world")
     if up not in UP_AXES:  # here, as scans have readers of their own
         raise ArgumentError(f"up must be 'auto', 'y' or 'z', got {up!r}")
     options = {

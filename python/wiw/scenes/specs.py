@@ -5,12 +5,14 @@ from __future__ import annotations
 
 import difflib
 import re
+from collections.abc import Iterator
+from contextlib import contextmanager
 from os import PathLike, fspath
 from pathlib import Path
 from typing import Any
 
 from wiw import _core
-from wiw.errors import ArgumentError, FileError
+from wiw.errors import ArgumentError, Error, FileError
 from wiw.scenes.scans import formats
 from wiw.suggestions import did_you_mean
 
@@ -40,14 +42,16 @@ def absolute(spec: str | PathLike[str]) -> str:
     """Return the spec, made absolute if it is a path, so that it means the same in any folder.
 
     Raises:
-        ArgumentError: it is neither text nor a path.
+        ArgumentError: it is neither text nor a path, or is in the home of a user who is not known.
+        FileError: it cannot be looked for.
     """
     spec = _require_text(spec)
-    scan = formats.parse_spec(spec)
-    if scan is not None:
-        kind, folder, split = scan
-        return ":".join(filter(None, [kind, str(folder.expanduser().absolute()), split]))
-    return spec if is_generated(spec) or _resembles_generated(spec) else str(Path(spec).expanduser().absolute())
+    with blame_path(spec):
+        scan = formats.parse_spec(spec)
+        if scan is not None:
+            kind, folder, split = scan
+            return ":".join(filter(None, [kind, str(folder.expanduser().absolute()), split]))
+        return spec if is_generated(spec) or _resembles_generated(spec) else str(Path(spec).expanduser().absolute())
 
 
 def resolve(spec: str | PathLike[str]) -> list[str]:
@@ -60,10 +64,33 @@ def resolve(spec: str | PathLike[str]) -> list[str]:
     number, so that equal scenes have equal names; whether the apartment allows the edits is checked when it is opened.
 
     Raises:
-        ArgumentError: the split, a number or an edit is invalid.
-        FileError: the file does not exist, or the folder has no scan.
+        ArgumentError: the split, a number or an edit is invalid, or the home of a user who is not known is named.
+        FileError: the file does not exist or cannot be looked for, or the folder has no scan.
     """
     spec = _require_text(spec)
+    with blame_path(spec):
+        return _resolve(spec)
+
+
+@contextmanager
+def blame_path(path: str | PathLike[str]) -> Iterator[None]:
+    """Turn what the system says while it looks for a path into an error that names the path.
+
+    Raises:
+        ArgumentError: it is in the home of a user who is not known.
+        FileError: it cannot be looked for, such as in a folder that may not be read.
+    """
+    try:
+        yield
+    except Error:
+        raise
+    except RuntimeError as error:
+        raise ArgumentError(f"{path}: {error}") from error
+    except OSError as error:
+        raise FileError(f"{path}: {error.strerror or error}") from error
+
+
+def _resolve(spec: str) -> list[str]:
     scan = formats.parse_spec(spec)
     if scan is not None:
         return [str(file) for file in formats.find_scans(*scan)]

@@ -14,6 +14,7 @@ from hypothesis import strategies as st
 
 from wiw.datasets import episodes as files
 from wiw.datasets.cameras import camera_pose
+from wiw.datasets.decisions import Decisions, load_decisions, read_scenes, save_decisions
 from wiw.datasets.habitat import heading_of, yaw_of
 from wiw.datasets.worlds import world
 from wiw.errors import ArgumentError, FileError
@@ -339,3 +340,13 @@ def test_a_file_of_episodes_leaves_no_option_unused(option) -> None:
 def test_a_folder_of_scenes_without_a_file_of_episodes_is_refused() -> None:
     with pytest.raises(ArgumentError, match="scene_folder is where the scenes of an episode file are"):
         ImageNav(scene_folder="scans")
+
+
+def test_a_file_without_decisions_is_named(tmp_path: Path) -> None:
+    pytest.importorskip("pyarrow")
+    picture = np.zeros((0, 4, 8, 3), np.uint8)
+    none = Decisions((), picture, picture, np.zeros((0, 2, 3), np.int8), picture[:, None], np.zeros((0, 2)))
+    save_decisions(tmp_path / "none.parquet", none)
+    assert read_scenes(tmp_path / "none.parquet") == []
+    with pytest.raises(FileError, match=r"none\.parquet: expected stored decisions, got a file without any"):
+        load_decisions(tmp_path / "none.parquet")

@@ -12,9 +12,10 @@ from typing import Any
 import numpy as np
 import pytest
 
+from wiw.datasets import episodes
 from wiw.datasets.questions import Question, openeqa
 from wiw.datasets.worlds import world
-from wiw.errors import FileError
+from wiw.errors import ArgumentError, FileError
 
 ITEM: dict[str, Any] = {
     "question": "What is above the table?",
@@ -126,6 +127,8 @@ def test_a_start_of_the_list_is_checked_against_the_mesh(two_rooms: str, tmp_pat
             "item 1: rotation: expected a unit quaternion in order wxyz",
         ),
         ({"position": [0, 1, 2], "rotation": [0, 1, 0, 0]}, "item 1: rotation: .*not about the vertical"),
+        ({"position": [10**400, 1, 2], "rotation": [1, 0, 0, 0]}, "item 1: position: expected a finite number"),
+        ({"position": [0, 1, 2], "rotation": [10**400, 0, 0, 0]}, "item 1: .*too large"),
     ],
 )
 def test_a_damaged_item_is_a_typed_error_naming_file_index_and_field(
@@ -160,13 +163,22 @@ def test_a_number_that_is_none_is_a_typed_error(tmp_path: Path) -> None:
         openeqa.load(path)
 
 
+def test_episodes_without_a_start_are_not_saved(tmp_path: Path) -> None:
+    found = openeqa.load(write(tmp_path / "list.json", ITEM))
+    with pytest.raises(ArgumentError, match=r"mine\.json: expected episodes with starts"):
+        episodes.save(tmp_path / "mine.json", found, "aeqa")
+    assert not (tmp_path / "mine.json").exists()
+
+
 def test_an_unknown_scene_is_a_typed_error(tmp_path: Path) -> None:
     path = write(tmp_path / "list.json", ITEM)
     with pytest.raises(FileError, match=r"item 0: episode_history '000-hm3d-two_rooms': .* has no scene two_rooms"):
         openeqa.load(path, tmp_path)
 
 
-@pytest.mark.parametrize("body", ["[]", '{"a1": "far"}', '{"a1": 0}', '{"a1": -3.5}', '{"a1": null}'])
+@pytest.mark.parametrize(
+    "body", ["[]", '{"a1": "far"}', '{"a1": 0}', '{"a1": -3.5}', '{"a1": null}', f'{{"a1": 1{"0" * 400}}}']
+)
 def test_damaged_lengths_are_a_typed_error(tmp_path: Path, body: str) -> None:
     path = write(tmp_path / "list.json", ITEM)
     (tmp_path / "gt_path_length.json").write_text(body)

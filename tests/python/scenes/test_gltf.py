@@ -397,6 +397,24 @@ def test_links_of_robots_may_be_gltf(tmp_path: Path) -> None:
         read_surface(file, link="hand")
 
 
+def test_a_mesh_without_material_in_a_world_takes_no_other_ones(tmp_path: Path) -> None:
+    model = '<model name="{0}"><pose>{1} 0 0 0 0 0</pose><link name="l"><visual name="v"><geometry><mesh><uri>{0}.glb'
+    model += "</uri></mesh></geometry></visual></link></model>"
+    red, plain = Glb(), Glb()
+    red.materials.append({"pbrMetallicRoughness": {"baseColorFactor": [1, 0, 0, 1]}})
+    red.node(red.mesh(TWO, 0, POSITION=SQUARE))
+    plain.node(plain.mesh(TWO, POSITION=SQUARE))
+    save(red, tmp_path / "a.glb")
+    save(plain, tmp_path / "b.glb")
+    drawn = []
+    for models in ((model.format("b", 0),), (model.format("a", 50), model.format("b", 0))):
+        world = "<sdf version='1.7'><world name='w'>" + "".join(models) + "</world></sdf>"
+        (tmp_path / "w.sdf").write_text(world)
+        drawn.append(draw(load(tmp_path / "w.sdf")))
+    assert drawn[0].std() > 0 or drawn[0].mean() > 50
+    np.testing.assert_array_equal(*drawn)
+
+
 @pytest.mark.parametrize(("mode", "corners"), [(5, [0, 1, 3, 2]), (6, [0, 1, 2, 3])])
 def test_strips_and_fans_are_drawn(tmp_path: Path, mode: int, corners: list[int]) -> None:
     glb = Glb()

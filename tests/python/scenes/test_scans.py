@@ -183,6 +183,9 @@ class TestMatterport:
         [
             (lambda text: text.replace("ASCII 1.1", "ASCII 2.0"), "expected 'ASCII 1.1' in the first line"),
             (lambda text: text.replace("\nO 6", "\nX 6"), "has 6 objects, but its header says 7"),
+            (lambda text: text.replace("2 0 7 7 2", "2 0 ² 7 2"), "has 7 objects, but its header says"),
+            (lambda text: text.replace("2 0 7 7 2", f"2 0 {'9' * 5000} 7 2"), "has 7 objects, but its header says 999"),
+            (lambda text: text.replace("\nO 6", "\nO -3"), "names object -3; expected ids from 0"),
             (lambda text: text.replace("R 1 0", "R 3 0"), "line .*: not a house record 'O' .*region 1 does not exist"),
             (lambda text: text.replace("C 4 104", "C x 104"), "line .*: not a house record 'C'"),
             (lambda text: text.replace("O 2 0 2 1.2", "O 2 0 2 nan"), "line .*: not a house record 'O' .*not finite"),
@@ -320,6 +323,36 @@ class TestHm3d:
         painted.write_bytes(painted.read_bytes().replace(b"bufferView", b"bufferVieW"))
         with pytest.raises(FileError, match=r"TEEsavR23oF\.semantic\.glb: cannot be read"):
             load(path)
+
+    def test_labels_of_coordinates_in_16_bits_are_those_of_floats(self, tmp_path: Path) -> None:
+        path = files.write_hm3d(tmp_path)
+        plain = load(path)
+        painted = files.painted_glb()
+        (uv,) = (entry for entry in painted.accessors if entry["type"] == "VEC2")
+        place = painted.views[uv["bufferView"]]
+        floats = np.frombuffer(painted.binary, np.float32, 2 * uv["count"], place["byteOffset"])
+        short = np.round(65535 * floats).astype(np.uint16).tobytes()
+        uv |= {"bufferView": painted.view(short), "componentType": 5123, "normalized": True}
+        (path.parent / "TEEsavR23oF.semantic.glb").write_bytes(painted.bytes())
+        assert [(t["name"], t["triangle_count"]) for t in load(path).instances] == [
+            (t["name"], t["triangle_count"]) for t in plain.instances
+        ]
+
+    def test_a_painted_mesh_that_says_nothing_is_a_file_error(self, tmp_path: Path) -> None:
+        path = files.write_hm3d(tmp_path)
+        corners, none = np.eye(3, dtype=np.float32), np.zeros((0, 3), np.uint32)
+        one, uv, rgba = none.dtype.type([[0, 1, 2]]), np.zeros((3, 2), np.float32), np.zeros((3, 4), np.uint8)
+        empty, blank, moved = files.Glb(), files.Glb(), files.Glb()
+        empty.node(empty.mesh(none, POSITION=corners, COLOR_0=rgba))
+        blank.node(blank.mesh(one, blank.textured(blank.image(b"")), POSITION=corners, TEXCOORD_0=uv))
+        picture = moved.image(files.png(files.paintings()[0]))
+        moved.node(moved.mesh(one, moved.textured(picture), POSITION=corners, TEXCOORD_0=uv))
+        info = moved.materials[0]["pbrMetallicRoughness"]["baseColorTexture"]
+        info["extensions"] = {"KHR_texture_transform": {"scale": [2, 2]}}
+        for glb, message in ((empty, "no triangles"), (blank, "cannot be decoded"), (moved, "KHR_texture_transform")):
+            (path.parent / "TEEsavR23oF.semantic.glb").write_bytes(glb.bytes())
+            with pytest.raises(FileError, match=rf"TEEsavR23oF\.semantic\.glb: .*{message}"):
+                load(path)
 
 
 def test_without_the_decoder_a_scan_is_refused(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -488,6 +521,79 @@ class TestSceneDataset:
         NavMesh.build(load(path)).save(tmp_path / "navmeshes/flat.navmesh")
         assert navmesh_file(str(path)) == tmp_path / "navmeshes/flat.navmesh"
 
+    def test_the_stage_is_placed_as_the_scene_says(self, tmp_path: Path) -> None:
+        path = files.write_scene_dataset(tmp_path)
+        plain = by_name(load(path), "stage")
+        placed = {"translation": [10, 1, 0], "rotation": [0.70710678, 0, 0.70710678, 0], "uniform_scale": 2}
+        stage = json.loads(path.read_text())["stage_instance"] | placed
+        files.write_json(path, json.loads(path.read_text()) | {"stage_instance": stage})
+        turned = np.stack([plain[:, 2], plain[:, 1], -plain[::-1, 0]], axis=1)  # by 90 degrees to the left
+        assert np.allclose(by_name(load(path), "stage"), 2 * turned + [10, 1, 0], atol=1e-5)
+
+    def test_no_object_gets_a_ceiling(self, tmp_path: Path) -> None:
+        with pytest.raises(ArgumentError, match="a ceiling cannot be added to a scene dataset"):
+            load(files.write_scene_dataset(tmp_path), ceiling=2.4)
+
+    @pytest.mark.parametrize(
+        ("name", "section", "regions"),
+        [
+            ("words", {"words": "semantics/tiny_lexicon.json"}, False),
+            (
+                "%%CONFIG_NAME_AS_ASSET_FILENAME%%.semantic_config.json",
+                {
+                    "default_attributes": {"semantic_descriptor_filename": "../tiny_lexicon.json"},
+                    "paths": {".json": ["semantics/scenes/*"]},
+                },
+                True,
+            ),
+            ("labels", {"labels": "semantics/flat.house"}, False),
+        ],
+    )
+    def test_classes_and_rooms_are_those_of_the_file_that_the_dataset_names(
+        self, tmp_path: Path, name: str, section: dict[str, Any], regions: bool
+    ) -> None:
+        path = files.write_scene_dataset(tmp_path)
+        config = tmp_path / "tiny.scene_dataset_config.json"
+        body = json.loads(config.read_text()) | {"semantic_scene_descriptor_instances": section}
+        body["scene_instances"]["default_attributes"] = {"semantic_scene_instance": name}
+        files.write_json(config, body)
+        (tmp_path / "semantics/scenes").mkdir()
+        (tmp_path / "semantics/flat.house").write_text("ASCII 1.1")
+        region = {"name": "room 1", "label": "living_room", "min_bounds": [0, 0, -4], "max_bounds": [7, 2.6, 0]}
+        files.write_json(tmp_path / "semantics/scenes/home.semantic_config.json", {"region_annotations": [region]})
+        scene = load(path)
+        sofa = next(thing for thing in scene.instances if thing["name"] == "sofa 2")
+        assert sofa["category"] == ("sofa" if name == "labels" else "couch")
+        assert [room["type"] for room in scene.rooms] == ["living room"] * regions
+
+    def test_names_that_turn_up_later_are_read(self, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+        monkeypatch.setenv("WIW_CACHE", str(tmp_path / "cache"))
+        path = files.write_scene_dataset(tmp_path / "homes")
+        lexicon, table = (tmp_path / "homes/semantics" / name for name in ("tiny_lexicon.json", "objects.csv"))
+        config = tmp_path / "homes/tiny.scene_dataset_config.json"
+        section = {"paths": {".json": ["semantics/tiny_lexicon.json"]}}
+        files.write_json(config, json.loads(config.read_text()) | {"semantic_scene_descriptor_instances": section})
+        words = lexicon.read_text()
+        lexicon.unlink()
+
+        def categories() -> list[str]:
+            return [thing["category"] for thing in scenes.load(path, isolate=False).instances]
+
+        assert categories() == ["", "chair", "sofa", "sofa part", "chest"]
+        table.write_text("id,main_category\nchair,throne\n")
+        assert categories()[1:3] == ["throne", "sofa"]
+        lexicon.write_text(words)
+        assert categories()[1:3] == ["throne", "couch"]
+
+    def test_scenes_may_lie_outside_of_the_datasets_folder(self, tmp_path: Path) -> None:
+        path = files.write_scene_dataset(tmp_path / "homes")
+        (tmp_path / "val").mkdir()
+        config = tmp_path / "val/more.scene_dataset_config.json"
+        files.write_json(config, {"scene_instances": {"paths": {".json": [str(path.parent)]}}})
+        assert scenes.resolve(f"hssd:{tmp_path / 'val'}:scenes") == [str(path)]
+        with pytest.raises(FileError, match="holds no scan"):
+            scenes.resolve(f"hssd:{tmp_path / 'val'}:val")
+
     def test_a_folder_may_be_called_like_a_pattern(self, tmp_path: Path) -> None:
         assert load(files.write_scene_dataset(tmp_path / "homes [v2]*?")).instances
 
@@ -506,6 +612,7 @@ class TestSceneDataset:
             ({"object_instances": [{"template_name": "chair", "translation": [1, 2]}]}, "three finite numbers"),
             ({"object_instances": [{"template_name": "chair", "translation": [0, 0, 10**400]}]}, "OverflowError"),
             ({"object_instances": 3}, "cannot be read as a scene instance"),
+            ({"object_instances": [{"template_name": "chair", "uniform_scale": 1e300}]}, "vertex that is not finite"),
         ],
     )
     def test_a_damaged_scene_is_named(self, tmp_path: Path, change: dict[str, Any], message: str) -> None:

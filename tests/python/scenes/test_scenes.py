@@ -231,6 +231,20 @@ def test_unsupported_and_missing_files_are_named(tmp_path: Path) -> None:
         scenes.load(square(tmp_path), up="x")
 
 
+@pytest.mark.parametrize("read", [scenes.load, scenes.resolve, lambda path: scenes.resolve(f"hm3d:{path}:val")])
+def test_a_path_that_cannot_be_looked_for_is_named(read: Any) -> None:
+    with pytest.raises(ArgumentError, match=r"~nobody-here/x.glb.*: Could not determine home directory"):
+        read("~nobody-here/x.glb")
+    with pytest.raises(FileError, match=r"xxx.*: File name too long"):
+        read("x" * 300)
+
+
+def test_the_home_of_an_unknown_user_has_no_absolute_spec() -> None:
+    for spec in ("~nobody-here/x.glb", "hm3d:~nobody-here/scans:val"):
+        with pytest.raises(ArgumentError, match=r"~nobody-here.*: Could not determine home directory"):
+            scenes.absolute(spec)
+
+
 def test_a_file_may_be_called_like_the_apartments(tmp_path: Path) -> None:
     mesh = square(tmp_path, "apartments_scan.glb")
     assert scenes.resolve(mesh) == scenes.resolve(str(mesh)) == [str(mesh)]

@@ -117,7 +117,8 @@ void Assembler::add_mesh(const ModelVisual& visual, const Eigen::Affine3f& T_ins
     drawn = true;
     for (const std::uint32_t index : node.meshes) {
       const Mesh& mesh = part.scene->meshes[index];
-      const std::int32_t material = visual.color ? plain_material(*visual.color) : part.first_material + mesh.material;
+      const std::int32_t own = mesh.material == kNone ? kNone : part.first_material + mesh.material;
+      const std::int32_t material = visual.color ? plain_material(*visual.color) : own;
       instance.meshes.push_back(baker_.bake(mesh, T_instance_visual * scale * node.T_world_instance, material));
     }
   }

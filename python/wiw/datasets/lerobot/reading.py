@@ -77,7 +77,8 @@ class LeRobotFolder:
                 f"{self.folder / INFO}: expected features {', '.join(expected)}, got no {', '.join(missing)}"
             )
         for name, feature in expected.items():
-            got = found[name].get("dtype"), list(found[name].get("shape", ()))
+            entry = found[name] if isinstance(found[name], Mapping) else {}
+            got = entry.get("dtype"), entry.get("shape")
             if got != (feature.dtype, list(feature.shape)):
                 hint = "; images decoded from videos are no longer exact" if got[0] == "video" else ""
                 raise FileError(
@@ -221,7 +222,7 @@ def check_file_name(name: str) -> str:
     Raises:
         FileError: it leads elsewhere.
     """
-    parts = PurePosixPath(name).parts
-    if not name.endswith(".parquet") or ".." in parts or parts[0] == "/":
+    path = PurePosixPath(name)
+    if not name.endswith(".parquet") or ".." in path.parts or path.is_absolute():
         raise FileError(f"meta/episodes: expected file as the name of a Parquet file in the new folder, got {name}")
     return name

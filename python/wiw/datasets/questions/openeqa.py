@@ -100,7 +100,7 @@ def _episode(item: Any, where: str, lengths: Mapping[str, float]) -> Episode:
             geodesic=lengths.get(name, math.nan),
             info={"question": question.to_info(), "source": SOURCE},
         )
-    except (TypeError, ValueError) as error:
+    except (TypeError, ValueError, OverflowError) as error:
         raise FileError(f"{where}: {error}") from error
 
 

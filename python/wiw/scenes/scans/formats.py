@@ -18,7 +18,7 @@ from wiw.scenes.scans.scan import Imported, require_folder, require_scans
 
 __all__ = ["KINDS", "compare_tables", "find_all", "find_reader", "find_scans", "parse_spec", "read_scene"]
 
-VERSION = 1
+VERSION = 2
 """Raised when the same files give another scene."""
 
 _READERS = {

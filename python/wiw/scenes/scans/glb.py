@@ -98,6 +98,13 @@ class Glb:
         values = np.ndarray((count, width), dtype, data, start, (stride, dtype.itemsize))
         return values[:, 0] if width == 1 else values
 
+    def fractions(self, index: int) -> NDArray[Any]:
+        """Return an accessor's values as `values` does, normalised integers as fractions float32."""
+        values = self.values(index)
+        if values.dtype.kind == "f" or not self.items("accessors")[index].get("normalized"):
+            return values
+        return np.maximum(values / np.float32(np.iinfo(values.dtype).max), np.float32(-1))
+
     @cached_property
     def node_transforms(self) -> list[tuple[int, NDArray[np.float64]]]:
         """Mesh and transform [4, 4] to the file's axes of each node that shows a mesh."""

@@ -152,7 +152,7 @@ def read_painted(path: Path, table: Annotations, up: str) -> tuple[transfer.Labe
         meshes = [_placed_primitive(glb, *placed, up) for placed in _primitives(glb)]
     except UNREADABLE as error:
         raise FileError(f"{path}: cannot be read: {error} (damaged file?)") from error
-    if not meshes:
+    if not any(len(mesh.surface.triangles) for mesh in meshes):
         raise FileError(f"{path}: holds no triangles")
     offsets = np.cumsum([0, *(len(mesh.surface.vertices) for mesh in meshes[:-1])])
     surface = transfer.Surface(
@@ -212,7 +212,7 @@ def _primitives(glb: Glb) -> list[tuple[dict[str, Any], NDArray[np.float64]]]:
 
 def _placed_primitive(glb: Glb, primitive: dict[str, Any], transform: NDArray[np.float64], up: str) -> PaintedMesh:
     attributes = primitive["attributes"]
-    positions = glb.values(attributes["POSITION"]).astype(np.float64)
+    positions = glb.fractions(attributes["POSITION"]).astype(np.float64)
     vertices = to_y_up(positions @ transform[:3, :3].T + transform[:3, 3], up).astype(np.float32)
     if "indices" in primitive:
         corners = glb.values(primitive["indices"]).astype(np.uint32).reshape(-1, 3)
@@ -220,7 +220,7 @@ def _placed_primitive(glb: Glb, primitive: dict[str, Any], transform: NDArray[np
         corners = np.arange(len(vertices), dtype=np.uint32).reshape(-1, 3)
     if (corners.size and corners.max() >= len(vertices)) or not np.isfinite(vertices).all():
         raise ValueError("a triangle refers to a vertex that does not exist or is not finite")
-    uv = glb.values(attributes["TEXCOORD_0"]).astype(np.float32) if "TEXCOORD_0" in attributes else None
+    uv = glb.fractions(attributes["TEXCOORD_0"]).astype(np.float32) if "TEXCOORD_0" in attributes else None
     colors = _vertex_colors(glb.values(attributes["COLOR_0"])) if "COLOR_0" in attributes else None
     picture = _picture(glb, primitive) if uv is not None else None
     if picture is None and colors is None:
@@ -250,8 +250,11 @@ def _picture(glb: Glb, primitive: dict[str, Any]) -> NDArray[np.uint8] | None:
     info = material.get("pbrMetallicRoughness", {}).get("baseColorTexture") or material.get("emissiveTexture")
     if not info:
         return None
+    if "KHR_texture_transform" in info.get("extensions", {}):
+        raise ValueError("a label image is placed by KHR_texture_transform, which is not supported")
     image = glb.items("images")[glb.items("textures")[info["index"]]["source"]]
-    decoded = cv2.imdecode(np.frombuffer(glb.view(image["bufferView"]), np.uint8), cv2.IMREAD_COLOR)
+    data = np.frombuffer(glb.view(image["bufferView"]), np.uint8)
+    decoded = cv2.imdecode(data, cv2.IMREAD_COLOR) if len(data) else None
     if decoded is None:
         raise ValueError("a label image cannot be decoded")
     return np.ascontiguousarray(decoded[..., ::-1])

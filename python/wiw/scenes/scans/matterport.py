@@ -155,8 +155,8 @@ def _check_counts(path: Path, records: dict[str, list[tuple[int, list[str]]]], h
         raise FileError(f"{path}: has no header record 'H' (truncated file)")
     words = records["H"][0][1]
     for name, there, column in (("objects", house.objects, 8), ("regions", house.regions, 10)):
-        said = int(words[column]) if len(words) > column and words[column].isdigit() else None
-        if said != len(there):
+        said = words[column] if len(words) > column else None
+        if said != str(len(there)):
             raise FileError(f"{path}: has {len(there)} {name}, but its header says {said} (truncated or damaged file)")
 
 

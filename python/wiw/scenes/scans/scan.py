@@ -75,9 +75,10 @@ def number_objects(objects: Mapping[int, ScanObject], shown: Iterable[int], path
         shown: ids that have surface; an object without any has no category, so that no one looks for it.
         path: the file of the table, for errors.
     """
-    last = max(objects, default=0)
-    if min(objects, default=0) < 0 or last > MOST_OBJECTS:
-        raise FileError(f"{path}: names object {last}; expected ids from 0 to {MOST_OBJECTS} (damaged file?)")
+    first, last = min(objects, default=0), max(objects, default=0)
+    if first < 0 or last > MOST_OBJECTS:
+        wrong = first if first < 0 else last
+        raise FileError(f"{path}: names object {wrong}; expected ids from 0 to {MOST_OBJECTS} (damaged file?)")
     visible = set(shown)
     instances: list[dict[str, Any]] = [{"name": f"(no object {i})"} for i in range(1, last + 1)]
     ids: dict[int, int] = {}

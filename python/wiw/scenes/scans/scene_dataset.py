@@ -9,6 +9,7 @@ dataset's default, else Y, as glTF has it.
 from __future__ import annotations
 
 import glob
+import os
 import re
 from collections.abc import Mapping
 from dataclasses import dataclass, field
@@ -20,7 +21,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from wiw import _core
-from wiw.errors import Error, FileError
+from wiw.errors import ArgumentError, Error, FileError
 from wiw.json_text import parse_json
 from wiw.scenes.basis import import_scan
 from wiw.scenes.scans.scan import (
@@ -43,6 +44,9 @@ _CONFIG_OF = {
     "objects": ".object_config.json",
     "articulated_objects": ".ao_config.json",
 }
+_SEMANTICS, _SEMANTIC_ENDING = "semantic_scene_descriptor_instances", ".semantic_config.json"
+_OWN_NAME = "%%CONFIG_NAME_AS_ASSET_FILENAME%%"
+"""Stands for a scene's own name in defaults of its dataset."""
 _NO_WORDS = {"frl", "apartment", "robo", "thor"}
 _LEVELS = 6
 """Folders above a scene in which its dataset's configuration is looked for."""
@@ -72,6 +76,7 @@ class Dataset:
     path: Path
     body: Mapping[str, Any]
     read: list[Path] = field(default_factory=list)
+    absent: list[Path] = field(default_factory=list)
 
     @staticmethod
     def open(path: Path) -> Dataset:
@@ -82,10 +87,29 @@ class Dataset:
         """
         return Dataset(path, read_object(path), [path])
 
+    def read_scene(self, file: Path) -> Mapping[str, Any]:
+        """Return a scene's values, over the dataset's defaults.
+
+        Raises:
+            FileError: it is missing or no JSON object, or the defaults are none.
+        """
+        return {**self.defaults("scene_instances"), **read_object(file)}
+
     def section(self, name: str) -> Mapping[str, Any]:
         """Return a section, empty if there is none."""
         found = self.body.get(name, {})
         return found if isinstance(found, Mapping) else {}
+
+    def defaults(self, section: str) -> Mapping[str, Any]:
+        """Return a section's default attributes.
+
+        Raises:
+            FileError: what stands there is something else.
+        """
+        found = self.section(section).get("default_attributes", {})
+        if not isinstance(found, Mapping):
+            raise FileError(f"{self.path}: {section}: default_attributes: expected an object, got {found!r:.80}")
+        return found
 
     def list_patterns(self, section: str) -> Mapping[str, list[str]]:
         """Return where a section's files are, by kind (".json", ".glb").
@@ -104,11 +128,24 @@ class Dataset:
         found: dict[Path, None] = {}
         here = Path(glob.escape(str(self.path.parent)))  # a folder's own name is no pattern
         for pattern in self.list_patterns(section).get(kind, []):
-            for match in sorted(glob.glob(str(here / pattern))):  # noqa: PTH207 - may lead up, by ".."
-                place = Path(match)
+            matches = sorted(glob.glob(str(here / pattern)))  # noqa: PTH207 - may lead up, by ".."
+            if not matches:
+                self.absent.append(self.path.parent / pattern)
+            for place in map(Path, matches):
                 files = sorted(place.glob(f"*{ending}")) if place.is_dir() else [place]
                 found |= {file: None for file in files if file.name.endswith(ending)}
         return list(found)
+
+    def find_named(self, section: str, name: Any, scene: Path, kind: str, ending: str) -> Path | None:
+        """Return the file of a section that a scene names, by a handle or by the file's own name; None without one."""
+        if not isinstance(name, str) or not name:
+            return None
+        name = name.replace(_OWN_NAME, scene.name.removesuffix(ENDING))
+        wanted = Path(name).name.removesuffix(ending)
+        listed = [self.path.parent / str(path) for handle, path in self.section(section).items() if handle == name]
+        found = [path for path in self.find_files(section, kind, ending) if path.name.removesuffix(ending) == wanted]
+        self.absent += [path for path in listed if not path.is_file()]
+        return next((path for path in [*listed, *found] if path.is_file()), None)
 
     @cached_property
     def files(self) -> dict[str, dict[str, list[Path]]]:
@@ -133,18 +170,28 @@ class Dataset:
         file = next(iter(matching or candidates), None)
         if file is None:
             return None
-        defaults = self.section(section).get("default_attributes", {})
         own = read_object(file) if file.name.endswith(ending) else {}
         self.read.append(file)
-        return Template(file, {**defaults, **own})
+        return Template(file, {**self.defaults(section), **own})
 
-    @cached_property
-    def class_names(self) -> dict[int, str]:
-        """Names of classes by the `semantic_id` of objects, from the dataset's lexicons."""
+    def read_class_names(self, description: Path | None) -> dict[int, str]:
+        """Return names of classes by the `semantic_id` of objects, from lexicons.
+
+        Args:
+            description: what describes the scene: a lexicon, or a file that may name one.
+        """
+        files = [
+            file
+            for file in self.find_files(_SEMANTICS, ".json", ".json")
+            if not file.name.endswith(_SEMANTIC_ENDING) or "lexicon" in file.name
+        ]  # others are one for each scene, with its rooms
+        if description is not None:
+            named = {**self.defaults(_SEMANTICS), **read_object(description)}.get("semantic_descriptor_filename")
+            lexicon = description.parent / str(named) if named else description
+            files.append(lexicon if lexicon.is_file() else description)
+            self.absent += [] if lexicon.is_file() else [lexicon]
         names: dict[int, str] = {}
-        for file in self.find_files("semantic_scene_descriptor_instances", ".json", ".json"):
-            if file.name.endswith(".semantic_config.json") and "lexicon" not in file.name:
-                continue  # one for each scene, with its rooms
+        for file in dict.fromkeys(files):
             try:
                 names |= {int(entry["id"]): str(entry["name"]) for entry in read_object(file).get("classes", [])}
             except _UNREADABLE as error:
@@ -157,6 +204,7 @@ class Dataset:
         """Categories by template, from HSSD's `semantics/objects.csv`; empty if there is no such table."""
         file = self.path.parent / "semantics" / "objects.csv"
         if not file.is_file():
+            self.absent.append(file)
             return {}
         self.read.append(file)
         header, *lines = split_cells(file, read_text(file).splitlines()) or [[]]
@@ -192,7 +240,7 @@ def find(folder: Path, split: str) -> list[Path]:
     if not configs:
         raise FileError(f"{place}: holds no *{CONFIG}, which lists the dataset's scenes")
     found = {file.absolute() for config in configs for file in _scenes_of(Dataset.open(config))}
-    chosen = [file for file in found if not split or split in file.relative_to(place.absolute()).parts[:-1]]
+    chosen = [file for file in found if not split or split in Path(os.path.relpath(file.parent, place)).parts]
     return require_scans(chosen, place, f"*{ENDING} where the patterns of {configs[0].name} lead")
 
 
@@ -217,14 +265,9 @@ def find_dataset(file: Path) -> Dataset:
 
 def find_navmesh(file: Path) -> Path | None:
     """Return the navigation mesh that a scene names, if the file is there."""
-    dataset, name = find_dataset(file), read_object(file).get("navmesh_instance")
-    if not isinstance(name, str) or not name:
-        return None
-    section = dataset.section("navmesh_instances")
-    wanted = Path(name).name.removesuffix(".navmesh")
-    listed = [dataset.path.parent / str(path) for handle, path in section.items() if handle == name]
-    found = [path for path in dataset.find_files("navmesh_instances", ".navmesh", ".navmesh") if path.stem == wanted]
-    return next((path for path in [*listed, *found] if path.is_file()), None)
+    dataset = find_dataset(file)
+    name = dataset.read_scene(file).get("navmesh_instance")
+    return dataset.find_named("navmesh_instances", name, file, ".navmesh", ".navmesh")
 
 
 # ---- transforms
@@ -259,8 +302,8 @@ def _frame(attributes: Mapping[str, Any]) -> NDArray[np.float64]:
 class _Assembly:
     """Parts of a scene, gathered before anything is put together, so that all that is missing can be named."""
 
-    def __init__(self, dataset: Dataset, options: Mapping[str, Any]) -> None:
-        self.dataset, self.options = dataset, options
+    def __init__(self, dataset: Dataset, description: Path | None, options: Mapping[str, Any]) -> None:
+        self.dataset, self.description, self.options = dataset, description, options
         self.parts: list[_core.scene.Scene] = []
         self.indices: dict[Path, int] = {}
         self.boxes: dict[Path, NDArray[np.float64]] = {}
@@ -270,6 +313,11 @@ class _Assembly:
         self.read: list[Path] = []
         self.absent: list[Path] = []
         self.warnings: list[str] = []
+
+    @cached_property
+    def class_names(self) -> dict[int, str]:
+        """Names of classes by the `semantic_id` of objects."""
+        return self.dataset.read_class_names(self.description)
 
     def part(self, file: Path) -> int | None:
         """Return the index of a mesh, in its own axes; None, and noted, if there is no such file."""
@@ -301,7 +349,7 @@ class _Assembly:
     def _describe(self, name: str, template: Template) -> dict[str, Any]:
         stem = re.split(r"\.(?:object|stage|ao)_config", template.file.name)[0].removesuffix(template.file.suffix)
         semantic = template.attributes.get("semantic_id")
-        by_class = self.dataset.class_names.get(int(semantic)) if semantic else None
+        by_class = self.class_names.get(int(semantic)) if semantic else None
         category = by_class or self.dataset.listed_names.get(stem) or words_of(stem)
         attributes = {"template": stem} | ({"semantic_id": str(int(semantic))} if semantic else {})
         return {"name": name, "category": category.lower().replace("_", " "), "attributes": attributes}
@@ -320,16 +368,23 @@ def read(file: Path, options: dict[str, Any]) -> Imported:
 
     Raises:
         FileError: it or its dataset is damaged, or files and templates that it names do not exist; names all of them.
+        ArgumentError: a ceiling is asked for.
     """
-    dataset, body = find_dataset(file), read_object(file)
-    assembly = _Assembly(dataset, options)
+    if options.get("ceiling") is not None:
+        raise ArgumentError(f"{file}: a ceiling cannot be added to a scene dataset")
+    dataset = find_dataset(file)
+    body = dataset.read_scene(file)
+    description = dataset.find_named(_SEMANTICS, body.get("semantic_scene_instance"), file, ".json", _SEMANTIC_ENDING)
+    if description is not None and description.suffix != ".json":  # of a scan's labels, which objects do not need
+        description = None
+    assembly = _Assembly(dataset, description, options)
     try:
         _add_stage(body, assembly)
         for placed in body.get("object_instances", []):
             _add_object(placed, str(body.get("translation_origin", "")), assembly)
         for placed in body.get("articulated_object_instances", []):
             _add_articulated(placed, assembly)
-        rooms = _rooms(body, dataset)
+        rooms = [] if description is None else _read_rooms(description)
     except Error:
         raise
     except _UNREADABLE as error:
@@ -341,28 +396,41 @@ def read(file: Path, options: dict[str, Any]) -> Imported:
     nameless = sum(not instance["category"] for instance in assembly.instances[1:])
     if nameless:
         assembly.warnings.append(f"{nameless} of {len(assembly.instances) - 1} objects have no category")
-    scene = _core.scene.Scene.assembled(
-        assembly.parts,
-        assembly.placements,
-        assembly.instances,
-        rooms=rooms,
-        name=file.name.removesuffix(ENDING),
-        attributes={
-            "up": "Y (scene dataset)",
-            "dataset": dataset.path.name.removesuffix(CONFIG),
-            "labels": "scene dataset",
-        },
-        warnings=assembly.warnings,
-    )
-    return Imported(scene, [file, *dict.fromkeys([*dataset.read, *assembly.read])], assembly.absent)
+    attributes = {
+        "up": "Y (scene dataset)",
+        "dataset": dataset.path.name.removesuffix(CONFIG),
+        "labels": "scene dataset",
+    }
+    try:
+        scene = _core.scene.Scene.assembled(
+            assembly.parts,
+            assembly.placements,
+            assembly.instances,
+            rooms=rooms,
+            name=file.name.removesuffix(ENDING),
+            attributes=attributes,
+            warnings=assembly.warnings,
+        )
+    except ArgumentError as error:  # numbers of the file that no scene can have
+        raise FileError(f"{file}: {error}") from error
+    read = [*dataset.read, *assembly.read, *([] if description is None else [description])]
+    return Imported(scene, [file, *dict.fromkeys(read)], [*dataset.absent, *assembly.absent])
 
 
 def _add_stage(body: Mapping[str, Any], assembly: _Assembly) -> None:
-    template = assembly.template("stages", body["stage_instance"]["template_name"])
+    placed = body["stage_instance"]
+    template = assembly.template("stages", placed["template_name"])
     if template is not None:
-        linear = np.diag(_vector(template.attributes.get("scale"), 1)) @ _frame(template.attributes)
-        assembly.add("stage", template, [(template.asset("render_asset"), _affine(linear, np.zeros(3)))])
+        turn = rotation_of(placed.get("rotation", (1, 0, 0, 0)))
+        matrix = _affine(turn @ _linear(placed, template), _vector(placed.get("translation"), 0))
+        assembly.add("stage", template, [(template.asset("render_asset"), matrix)])
         assembly.instances[-1]["category"] = ""
+
+
+def _linear(placed: Mapping[str, Any], template: Template) -> NDArray[np.float64]:
+    """Return the map [3, 3] from a mesh's axes to those of its instance, scaled."""
+    scale = _vector(placed.get("non_uniform_scale"), 1) * float(placed.get("uniform_scale", 1))
+    return np.diag(scale * _vector(template.attributes.get("scale"), 1)) @ _frame(template.attributes)
 
 
 def _add_object(placed: Mapping[str, Any], scene_origin: str, assembly: _Assembly) -> None:
@@ -373,8 +441,7 @@ def _add_object(placed: Mapping[str, Any], scene_origin: str, assembly: _Assembl
     index = assembly.part(file)
     if index is None:
         return
-    scale = _vector(placed.get("non_uniform_scale"), 1) * float(placed.get("uniform_scale", 1))
-    linear = np.diag(scale * _vector(template.attributes.get("scale"), 1)) @ _frame(template.attributes)
+    linear = _linear(placed, template)
     turn = rotation_of(placed.get("rotation", (1, 0, 0, 0)))
     origin = np.zeros(3)
     if str(placed.get("translation_origin", scene_origin)).lower() != "asset_local":
@@ -408,19 +475,13 @@ def _add_articulated(placed: Mapping[str, Any], assembly: _Assembly) -> None:
     assembly.add(f"{Path(str(placed['template_name'])).name} {len(assembly.instances)}", template, meshes)
 
 
-def _rooms(body: Mapping[str, Any], dataset: Dataset) -> list[dict[str, Any]]:
-    """Return the rooms of a scene that its semantic description has, as HSSD's does."""
-    name = body.get("semantic_scene_instance")
-    for file in dataset.find_files("semantic_scene_descriptor_instances", ".json", ".semantic_config.json"):
-        if not isinstance(name, str) or file.name.removesuffix(".semantic_config.json") != Path(name).name:
-            continue
-        dataset.read.append(file)
-        return [
-            {
-                "name": str(region["name"]),
-                "type": str(region.get("label", "")).replace("_", " "),
-                "bounds": box_to_y_up(region["min_bounds"], region["max_bounds"], "y"),
-            }
-            for region in read_object(file).get("region_annotations", [])
-        ]
-    return []
+def _read_rooms(description: Path) -> list[dict[str, Any]]:
+    """Return the rooms that a scene's semantic description has, as HSSD's does."""
+    return [
+        {
+            "name": str(region["name"]),
+            "type": str(region.get("label", "")).replace("_", " "),
+            "bounds": box_to_y_up(region["min_bounds"], region["max_bounds"], "y"),
+        }
+        for region in read_object(description).get("region_annotations", [])
+    ]
