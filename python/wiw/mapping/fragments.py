@@ -79,9 +79,9 @@ def find_fragments(
     """Find the fragments of all categories that are `things` (bool [categories]).
 
     Raises:
-        ArgumentError: labels of another shape than the views, or of unknown categories.
+        ArgumentError: labels of another shape than the views, or of unknown categories or states.
     """
-    category = _check_labels(views, labels, len(things))
+    category = _check_labels(views, labels, len(things), states)
     wanted = np.where(things[category] & find_packable(views) & (labels.confidence >= least_confidence), category, 0)
     wanted[cut_depth_steps(wanted, views.depth)] = 0
     index = np.zeros(wanted.shape, np.int32)
@@ -212,12 +212,14 @@ def _find_parts(points: NDArray[np.float64], bridged: bool) -> list[NDArray[np.f
     return [points[part == number, :2] for number in np.flatnonzero(counts >= max(1.0, SCRAP * counts.max()))]
 
 
-def _check_labels(views: Views, labels: Labels, categories: int) -> NDArray[np.uint8]:
+def _check_labels(views: Views, labels: Labels, categories: int, states: int) -> NDArray[np.uint8]:
     shapes = [array.shape for array in (labels.category, labels.confidence, labels.state)]
     if any(shape != views.depth.shape for shape in shapes):
         raise ArgumentError(f"labels: expected category, confidence and state of {views.depth.shape}, got {shapes}")
     if labels.category.max(initial=0) >= categories:
         raise ArgumentError(f"labels: expected categories below {categories}, got {labels.category.max()}")
+    if labels.state.max(initial=0) >= states:
+        raise ArgumentError(f"labels: expected states below {states}, got {labels.state.max()}")
     return labels.category
 
 

@@ -90,12 +90,12 @@ def route(
         ArgumentError: a target that is neither.
     """
     goal = np.asarray(target, np.float64)
+    if goal.shape not in ((), (2,), (3,)) or not np.isfinite(goal).all():
+        raise ArgumentError(f"route: expected a finite point [2] or [3], or a heading, got {target!r}")
     if goal.ndim == 0:
         found = follow_heading(grid, pose, float(goal), 0.0)
-    elif goal.shape in ((2,), (3,)) and np.isfinite(goal).all():
-        found = _route_to_point(grid, np.asarray(pose, np.float64), goal[:2], radius)
     else:
-        raise ArgumentError(f"route: expected a finite point [2] or [3], or a heading, got {target!r}")
+        found = _route_to_point(grid, np.asarray(pose, np.float64), goal[:2], radius)
     return found if first is None else found.take(first)
 
 

@@ -61,6 +61,8 @@ class Detector(ABC):
             ArgumentError: arrays of other shapes or types, names that are empty or repeated, or missing ids.
             ContractError: the detector does not return one result per image, or returns names that were not requested.
         """
+        if isinstance(names, str):
+            raise ArgumentError(f"detect: expected a list of names, such as ['{names}'], got '{names}'")
         names = list(names)
         if any(not name.strip() for name in names) or len(set(names)) < len(names):
             raise ArgumentError(f"detect: expected distinct, non-empty names, got {names}")

@@ -41,8 +41,9 @@ class DetectorLabeller(Labeller):
         names: Sequence[str] = OBJECTS,
         least_score: float = 0.3,
     ) -> None:
-        if any(not name.strip() for name in names) or len(set(names)) < len(names) or not 0 < len(names) < 256:
-            raise ArgumentError(f"DetectorLabeller: expected 1 to 255 distinct names, got {list(names)}")
+        distinct = not isinstance(names, str) and all(name.strip() for name in names) and len(set(names)) == len(names)
+        if not distinct or not 0 < len(names) < 256:
+            raise ArgumentError(f"DetectorLabeller: expected 1 to 255 distinct names, got {names!r}")
         self.categories = ("", *names)
         self.detector: Detector = DETECTORS.make(detector)
         self.segmenter: Segmenter = SEGMENTERS.make(segmenter)

@@ -36,7 +36,7 @@ class GroundingDino(Detector):
     Raises:
         DependencyError: torch or transformers is not installed.
         WeightsError: the weights cannot be loaded or belong to another network; its `kind` says why.
-        ArgumentError: there is no such device.
+        ArgumentError: there is no such device, or a batch below 1.
     """
 
     def __init__(
@@ -48,6 +48,7 @@ class GroundingDino(Detector):
         overlap: float = 0.5,
         batch: int = 4,
     ) -> None:
+        pretrained.require_batch("GroundingDino", batch)
         pretrained.import_transformers()
         self.threshold, self.overlap, self.batch = threshold, overlap, batch
         self.device = resolve_device(device)

@@ -33,7 +33,7 @@ class OwlViT(Detector):
     Raises:
         DependencyError: torch or transformers is not installed.
         WeightsError: the weights cannot be loaded or belong to another network; its `kind` says why.
-        ArgumentError: there is no such device.
+        ArgumentError: there is no such device, or a batch below 1.
     """
 
     def __init__(
@@ -46,6 +46,7 @@ class OwlViT(Detector):
         template: str = "a photo of a {}",
         batch: int = 4,
     ) -> None:
+        pretrained.require_batch("OwlViT", batch)
         pretrained.import_transformers()
         self.threshold, self.overlap, self.template, self.batch = threshold, overlap, template, batch
         self.device = resolve_device(device)

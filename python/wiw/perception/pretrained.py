@@ -76,6 +76,16 @@ def import_transformers() -> Any:
         raise DependencyError(f"{error.name or error} not installed; pip install 'wiw[torch]'") from error
 
 
+def require_batch(where: str, batch: int) -> None:
+    """Check the number of images in one call of a network.
+
+    Raises:
+        ArgumentError: there is none.
+    """
+    if batch < 1:
+        raise ArgumentError(f"{where}: expected a batch of at least 1, got {batch}")
+
+
 def to_square_batch(images: Sequence[NDArray[np.uint8]], side: int, device: str) -> Any:
     """Resize images to a normalised float tensor [B, 3, side, side], ignoring aspect ratios, as SAM 2 expects."""
     import torch

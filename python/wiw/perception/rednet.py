@@ -36,7 +36,7 @@ class RedNet(Semantics):
     Raises:
         DependencyError: torch is not installed.
         WeightsError: there is no such file ("missing"), or it is no such checkpoint ("unfit").
-        ArgumentError: a face that is not a multiple of 32, no range of depths, or no such device.
+        ArgumentError: a face that is not a multiple of 32, no range of depths, a batch below 1, or no such device.
     """
 
     needs = ("depth",)
@@ -53,6 +53,8 @@ class RedNet(Semantics):
             raise ArgumentError(f"face: expected a multiple of {STRIDE}, got {face}")
         if not 0 <= metres[0] < metres[1]:
             raise ArgumentError(f"metres: expected a range such as (0, 10), got {metres}")
+        if batch < 1:
+            raise ArgumentError(f"batch: expected at least 1, got {batch}")
         self.face, self.metres, self.batch = face, metres, batch
         path = Path(weights).expanduser()
         self.weights = path / FILE if path.is_dir() else path

@@ -10,6 +10,7 @@ from collections.abc import Sequence
 from http.client import HTTPException
 from typing import Any
 from urllib.error import HTTPError
+from urllib.parse import urlsplit
 from urllib.request import ProxyHandler, Request, build_opener
 
 import cv2
@@ -36,7 +37,7 @@ class Remote(Detector):
     """
 
     def __init__(self, address: str, seconds: float = 60.0) -> None:
-        if not address.startswith(("http://", "https://")):
+        if not _is_address(address):
             raise ArgumentError(f"expected a detector's address http://HOST:PORT, got '{address}'")
         if not seconds > 0:
             raise ArgumentError(f"seconds: expected more than 0, got {seconds}")
@@ -69,8 +70,7 @@ class Remote(Detector):
             with build_opener(ProxyHandler({})).open(request, timeout=self.seconds) as answer:
                 response = self._read_body(answer)
         except HTTPError as error:
-            text = error.read(2000).decode(errors="replace").strip()
-            raise RemoteError(f"{self.address} answered {error.code}: {text}", "raised") from error
+            raise RemoteError(f"{self.address} answered {error.code}: {_read_reason(error)}", "raised") from error
         except (OSError, HTTPException) as error:
             if isinstance(error, TimeoutError) or isinstance(getattr(error, "reason", None), TimeoutError):
                 text = f"{self.address}: no answer within {self.seconds} s; send fewer images or wait longer (seconds=)"
@@ -89,6 +89,22 @@ class Remote(Detector):
             if time.monotonic() > until:
                 raise TimeoutError
         return bytes(response)
+
+
+def _is_address(text: str) -> bool:
+    try:
+        parts = urlsplit(text)
+        return parts.scheme in ("http", "https") and bool(parts.hostname) and parts.port != 0
+    except ValueError:  # of a port that is no number, or half an IPv6 address
+        return False
+
+
+def _read_reason(error: HTTPError) -> str:
+    """Return the beginning of the text of an error, empty if it does not arrive."""
+    try:
+        return error.read(2000).decode(errors="replace").strip()
+    except (OSError, HTTPException):
+        return ""
 
 
 def _encode_png(image: NDArray[np.uint8]) -> str:

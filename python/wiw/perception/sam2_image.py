@@ -26,7 +26,7 @@ class Sam2Image(Segmenter):
     Raises:
         DependencyError: torch or transformers is not installed.
         WeightsError: the weights cannot be loaded or belong to another network; its `kind` says why.
-        ArgumentError: there is no such device.
+        ArgumentError: there is no such device, or a batch below 1.
     """
 
     def __init__(
@@ -36,6 +36,7 @@ class Sam2Image(Segmenter):
         device: str | None = None,
         batch: int = 4,
     ) -> None:
+        pretrained.require_batch("Sam2Image", batch)
         pretrained.import_transformers()
         self.batch, self.device = batch, resolve_device(device)
         kinds = ("sam2", "sam2_video")

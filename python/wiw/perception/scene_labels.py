@@ -88,7 +88,7 @@ class Labeller(ABC):
 
         Raises:
             ArgumentError: arrays of other shapes or types, a field of view out of range, or missing ids.
-            ContractError: the labeller's result has another shape or type.
+            ContractError: the labeller's result has another shape or type, or numbers out of range.
         """
         ids = self._check_views(images, hfov_deg, ids)
         if depth is not None and (depth.dtype != np.float32 or depth.shape != images.shape[:3]):
@@ -132,6 +132,15 @@ class Labeller(ABC):
                 f"{type(self).__name__}: expected category uint8, confidence float32 and state uint8 of {shape}, "
                 f"got {came}",
                 "shape",
+            )
+        least, most = found.confidence.min(initial=0), found.confidence.max(initial=0)
+        largest = int(found.category.max(initial=0)), int(found.state.max(initial=0))
+        counts = len(self.categories), len(STATES)
+        if not (least >= 0 and most <= 1 + 1e-3 and largest[0] < counts[0] and largest[1] < counts[1]):
+            raise ContractError(
+                f"{type(self).__name__}: expected categories below {counts[0]}, states below {counts[1]} and "
+                f"confidence from 0 to 1, got categories up to {largest[0]}, states up to {largest[1]} and confidence "
+                f"from {least:g} to {most:g}"
             )
 
 

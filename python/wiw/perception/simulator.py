@@ -24,7 +24,8 @@ class TrueBoxes(Detector):
 
     Args:
         categories: id to category; `read_categories(scene)`. Names match regardless of case, with spaces or
-        underscores. least_pixels: an instance with fewer visible pixels is not reported.
+            underscores.
+        least_pixels: an instance with fewer visible pixels is not reported.
     """
 
     needs = ("ids",)

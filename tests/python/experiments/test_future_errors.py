@@ -3,9 +3,11 @@
 
 from __future__ import annotations
 
+import shutil
 from dataclasses import replace
 from functools import cache
 from itertools import combinations
+from pathlib import Path
 
 import cv2
 import numpy as np
@@ -58,7 +60,7 @@ def env(two_rooms: str):
     return made
 
 
-def imagine(env, error=None, plans=(AHEAD,), model=None, decision=0, view="panorama", ends=False):
+def imagine(env, error=None, plans=(AHEAD,), model=None, decision=0, view="panorama", ends=False, shown=None):
     """The rollouts of an episode's plans, at a small size, and what goes with them."""
     model = model or Oracle(SIZE)
     error = make_error(error) if isinstance(error, str) else error
@@ -70,7 +72,7 @@ def imagine(env, error=None, plans=(AHEAD,), model=None, decision=0, view="panor
         plan_space(model.accepts.space),
         [key],
         [env.observation],
-        [ModelInput(env.observation)],
+        [shown or ModelInput(env.observation)],
         [list(plans)],
         [range(len(plans))],
         FrameSpec(view, SIZE, ends=ends),
@@ -281,6 +283,18 @@ def test_open_space_is_walked_through(env) -> None:
     start = fork.core.position
     assert np.linalg.norm(free[-1, [0, 2], 3] - start[[0, 2]]) == pytest.approx(6.0, abs=0.05)
     assert np.linalg.norm(blocked[[0, 2]] - start[[0, 2]]) < 5.9
+
+
+@pytest.mark.parametrize("error", ["scale@0.5", "missing@0.5"])
+def test_an_error_acts_in_no_other_scene_than_the_episodes(env, two_rooms: str, tmp_path: Path, error: str) -> None:
+    """A swapped placebo imagines in another episode's scene, where things have other ids and floor lies elsewhere."""
+    task = ImageNav(scenes=str(shutil.copy(two_rooms, tmp_path / f"elsewhere{Path(two_rooms).suffix}")))
+    elsewhere = task.environment()
+    elsewhere.begin(task.episode(0))
+    with pytest.raises(ArgumentError, match=f"'{error}' acts in the scene of the episode.*expected episodes of one"):
+        imagine(env, error, shown=ModelInput(elsewhere.observation, elsewhere.fork()))
+    imagine(env, "blur@4", shown=ModelInput(elsewhere.observation, elsewhere.fork()))
+    imagine(env, error, shown=ModelInput(env.observation, env.fork()))
 
 
 def test_copies_are_pasted_behind_what_is_nearer() -> None:

@@ -335,6 +335,8 @@ def test_a_target_of_another_kind_is_refused() -> None:
         route(OccupancyGrid(), np.zeros(3), np.zeros(4))
     with pytest.raises(ArgumentError, match="finite point"):
         route(OccupancyGrid(), np.zeros(3), np.array([np.nan, 0.0]))
+    with pytest.raises(ArgumentError, match="or a heading, got nan"):
+        route(OccupancyGrid(), np.zeros(3), float("nan"))
 
 
 def test_cells_and_points_agree() -> None:

@@ -290,6 +290,8 @@ def test_wrong_labels_are_refused() -> None:
         ObjectMap(NAMES).add(views, labels_of(np.zeros((4, 3, 3), np.uint8)))
     with pytest.raises(ArgumentError, match="categories below 6, got 9"):
         ObjectMap(NAMES).add(views, labels_of(np.full((4, *SIZE), 9, np.uint8)))
+    with pytest.raises(ArgumentError, match="states below 5, got 5"):
+        ObjectMap(NAMES).add(views, labels_of(np.zeros((4, *SIZE), np.uint8), state=5))
     with pytest.raises(ArgumentError, match="'' first"):
         ObjectMap(("chair", "table"))
 

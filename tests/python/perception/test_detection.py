@@ -78,6 +78,7 @@ def test_answers_that_break_the_contract_are_named(answer: Any, reason: str) -> 
         (IMAGES[0], ["a"], "uint8 \\[H, W, 3\\]"),
         (IMAGES.astype(float), ["a"], "float64"),
         (IMAGES, ["a", "a"], "distinct, non-empty names"),
+        (IMAGES, "chair", r"a list of names, such as \['chair'\], got 'chair'"),
         (IMAGES, [" "], "non-empty"),
     ],
 )
@@ -319,3 +320,26 @@ def test_nobody_is_there() -> None:
     assert raised.value.kind == "connection"
     with pytest.raises(ArgumentError, match="http://HOST:PORT"):
         DETECTORS.make("remote:localhost")
+    for wrong in ("http://", "http://127.0.0.1:port", "http://[::1"):
+        with pytest.raises(ArgumentError, match="http://HOST:PORT"):
+            DETECTORS.make(f"remote:{wrong}")
+
+
+def test_an_error_whose_text_does_not_arrive_is_the_servers() -> None:
+    class Failing(BaseHTTPRequestHandler):
+        def log_message(self, *args: Any) -> None: ...
+
+        def do_POST(self) -> None:
+            self.rfile.read(int(self.headers["Content-Length"]))
+            self.send_response(500)
+            self.send_header("Transfer-Encoding", "chunked")
+            self.end_headers()
+            self.wfile.write(b"no number\r\n")
+
+    with HTTPServer(("127.0.0.1", 0), Failing) as server:
+        thread = threading.Thread(target=server.handle_request)
+        thread.start()
+        with pytest.raises(RemoteError, match="answered 500") as raised:
+            DETECTORS.make(f"remote:http://127.0.0.1:{server.server_port}").detect(IMAGES[:1], ["a"])
+        thread.join()
+    assert raised.value.kind == "raised"

@@ -168,6 +168,15 @@ def test_weights_that_do_not_do_are_refused(folders: dict[str, Path], tmp_path: 
         SEGMENTERS.make("sam2", weights=folders["sam2"], device="hpu")
 
 
+@pytest.mark.parametrize("batch", [0, -1])
+def test_a_batch_has_an_image(batch: int) -> None:
+    for name in ("owlvit", "grounding-dino"):
+        with pytest.raises(ArgumentError, match=f"expected a batch of at least 1, got {batch}"):
+            DETECTORS.make(name, batch=batch)
+    with pytest.raises(ArgumentError, match=f"Sam2Image: expected a batch of at least 1, got {batch}"):
+        SEGMENTERS.make("sam2", batch=batch)
+
+
 def test_a_folder_that_lacks_weights_is_refused(folders: dict[str, Path], tmp_path: Path) -> None:
     """The library would draw what is missing at random."""
     from safetensors.torch import load_file, save_file

@@ -104,6 +104,19 @@ def test_views_and_labels_are_checked() -> None:
     assert Careless().label(images[:0], FIELD).category.shape == (0, 4, 6)
 
 
+@pytest.mark.parametrize("field, value", [("category", 2), ("state", 5), ("confidence", np.nan), ("confidence", 2)])
+def test_labels_out_of_range_are_not_mapped(field: str, value: float) -> None:
+    class Wrong(Careless):
+        def compute_labels(self, images: Any, hfov_deg: float, ids: Any, depth: Any) -> SceneLabels:
+            empty = np.zeros(images.shape[:3], np.uint8)
+            found = SceneLabels(empty, empty.astype(np.float32), empty.copy())
+            getattr(found, field)[0, 1, 1] = value
+            return found
+
+    with pytest.raises(ContractError, match="Wrong: expected categories below 2, states below 5 and confidence from 0"):
+        Wrong().label(np.zeros((1, 4, 6, 3), np.uint8), FIELD)
+
+
 def test_the_vocabulary() -> None:
     assert CATEGORIES[0] == "" == STATES[0] and len(set(CATEGORIES)) == len(CATEGORIES) < 256
     assert set(STRUCTURE) < set(CATEGORIES)
@@ -144,6 +157,8 @@ def test_the_surest_detection_is_on_top() -> None:
     assert labeller.describe()["detector"] == "Squares" and labeller.describe()["names"] == ["chair", "lamp"]
     with pytest.raises(ArgumentError, match="1 to 255 distinct names"):
         DetectorLabeller(Squares(), Whole(), ("chair", "chair"))
+    with pytest.raises(ArgumentError, match="1 to 255 distinct names, got 'lamp'"):
+        DetectorLabeller(Squares(), Whole(), "lamp")
 
 
 @pytest.fixture(scope="module")

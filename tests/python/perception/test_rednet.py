@@ -212,6 +212,8 @@ def test_what_it_cannot_use_is_named(checkpoint: Path, tmp_path: Path) -> None:
     assert raised.value.kind == "missing"
     with pytest.raises(ArgumentError, match="multiple of 32"):
         SEMANTICS.make("rednet", weights=checkpoint, face=48)
+    with pytest.raises(ArgumentError, match="batch: expected at least 1, got 0"):
+        SEMANTICS.make("rednet", weights=checkpoint, batch=0)
     with pytest.raises(ArgumentError, match="metres"):
         SEMANTICS.make("rednet", weights=checkpoint, metres=(5, 5))
     source = SEMANTICS.make("rednet", weights=checkpoint, device="cpu", face=32)

@@ -359,8 +359,9 @@ def test_weights_are_kept_with_their_shape(tmp_path: Path, shown: list[Demonstra
     assert damaged.value.kind == "unfit"
     with pytest.raises(WeightsError, match="of something else"):
         load(Path(wiw.__file__).parent / "world_models/warpnet/weights.safetensors")
-    with pytest.raises(ArgumentError, match="1 to 100 steps"):
-        wiw.policy("diffuser", weights=tmp_path / "weights.safetensors", steps=0)
+    for steps in (0, 2.5):
+        with pytest.raises(ArgumentError, match=f"1 to 100 steps, got {steps}"):
+            wiw.policy("diffuser", weights=tmp_path / "weights.safetensors", steps=steps)
     with pytest.raises(ArgumentError, match="width"):
         Shape(width=32)
 

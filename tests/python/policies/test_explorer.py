@@ -407,6 +407,22 @@ def test_time_that_is_nearly_up_makes_any_belief_final(episode, budget, actions)
     assert sink.results[0].metrics["answered"] == 1
 
 
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [
+        ({"sure": "high"}, "expected a number for sure, got 'high'"),
+        ({"sure": float("nan")}, "expected a number for sure, got nan"),
+        ({"path": float("inf")}, "expected a number for path, got inf"),
+        ({"budget": 0}, "expected a whole budget of at least 1, got 0"),
+        ({"budget": 12.5}, "expected a whole budget of at least 1, got 12.5"),
+        ({"calibrated": "never"}, "expected true or false for calibrated, got 'never'"),
+    ],
+)
+def test_options_that_are_no_numbers_are_refused_before_a_run(options, message):
+    with pytest.raises(ArgumentError, match=f"policy explorer: {message}"):
+        make_explorer(**options)
+
+
 # -- imagined views ----------------------------------------------------------------------------------------------------
 
 

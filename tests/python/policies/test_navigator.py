@@ -451,6 +451,8 @@ def test_what_the_policy_needs_is_asked_for_in_words(situate: Any) -> None:
         tiny_policy(doubt="much")
     for out_of_range, message in (
         ({"patience": 0}, "expected patience above 0, got 0"),
+        ({"patience": float("nan")}, "expected patience above 0, got nan"),
+        ({"trust": float("inf")}, "expected trust of 0 or more, got inf"),
         ({"spacing": -1}, "expected spacing of 0 or more, got -1"),
         ({"targets": 0}, "targets must be positive, got 0"),
         ({"doubt": 1}, "expected doubt below 1"),

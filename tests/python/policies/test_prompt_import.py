@@ -230,9 +230,43 @@ def test_titles_name_templates(title: str, name: str | None) -> None:
     assert name_template(title) == name
 
 
+@pytest.mark.parametrize(
+    "options",
+    [
+        "title=AR Planner Prompt",
+        "title={AR Planner Prompt}, overlay={\\node[left] at (0, 0) {a]};}",
+        "\n  breakable, % a remark ]\n  borderline west={2pt}{0pt}{red},\n  title=AR Planner Prompt\n",
+    ],
+)
+def test_a_box_keeps_all_of_its_text(options: str, tmp_path: Path) -> None:
+    body = "Plan {obs_key}.\n[\n  1,\n  2\n]\nThe end."
+    box = f"\\begin{{tcolorbox}}[{options}]\n{body}\n\\end{{tcolorbox}}\n"
+    (tmp_path / "paper.tex").write_text(box + BOX % ("AR Answerer Prompt", "Answer.\n]\nNow."))
+    found, unused = read_source(tmp_path / "paper.tex")
+    assert {name: prompt.text for name, prompt in found.items()} == {
+        "ar/planner": "Plan obs_key. [ 1, 2 ] The end.",
+        "ar/answerer": "Answer. ] Now.",
+    }
+    assert not unused and found["ar/planner"].place.endswith(f"paper.tex:{2 + options.count(chr(10))}")
+
+
 def test_unknown_tex_is_never_dropped() -> None:
     with pytest.raises(PromptError, match="here: expected an argument in braces"):
         convert_latex(r"\textbf x", lambda _: "here")
+    with pytest.raises(PromptError, match=r"here: unknown command \\\[; replace it"):
+        convert_latex(r"\[ x \]", lambda _: "here")
+
+
+@pytest.mark.parametrize(
+    ("tex", "text"),
+    [
+        (r"0.2\,m, 5\;s, a\ b\- c\@.", "0.2 m, 5 s, a b c."),
+        (r"\$5 \& 50\% \#1 a\_b \{c\}", "$5 & 50% #1 a_b {c}"),
+        ("one \\\\% a remark\ntwo% another\n three", "one\ntwothree"),
+    ],
+)
+def test_what_stands_behind_a_backslash_is_read_as_latex_does(tex: str, text: str) -> None:
+    assert convert_latex(tex, lambda _: "here") == text
 
 
 @pytest.fixture(scope="module")

@@ -23,6 +23,7 @@ from wiw.datasets.worlds import world
 from wiw.errors import ArgumentError, FileError
 from wiw.loop.scheduler import run_episodes
 from wiw.policies.recogniser import steering
+from wiw.policies.recogniser.policy import SHIPPED
 from wiw.tasks.ar import AR
 from wiw.types import Key, Proposal, Rollout
 
@@ -200,17 +201,25 @@ def test_turns_and_the_order_of_steering_cost_a_plan(two_rooms: str, tmp_path: P
     assert scores[1] - scores[2] == pytest.approx(0.05)
 
 
-@pytest.mark.parametrize("options", [{"views": 0}, {"remember": 0}, {"views": -1}])
+@pytest.mark.parametrize("options", [{"views": 0}, {"remember": 0}, {"views": -1}, {"remember": 1.5}])
 def test_no_glimpses_are_not_all_glimpses(options: dict[str, int]) -> None:
     with pytest.raises(ArgumentError, match="expected remember and views of at least 1"):
         wiw.policy("recogniser", **options)
 
 
-def test_weights_are_named_or_files(tmp_path: Path) -> None:
+@pytest.mark.parametrize("options", [{"lost": "much"}, {"turning": float("nan")}, {"trust": float("inf")}])
+def test_deductions_are_numbers(options: dict[str, Any]) -> None:
+    with pytest.raises(ArgumentError, match="expected numbers for lost, turning and trust"):
+        wiw.policy("recogniser", **options)
+
+
+def test_weights_are_named_or_files(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     with pytest.raises(ArgumentError, match=r"expected weights pictures or extents, or a file .*, got 'extent'"):
         wiw.policy("recogniser", weights="extent")
     with pytest.raises(FileError, match=r"nowhere\.safetensors"):
         wiw.policy("recogniser", weights=tmp_path / "nowhere.safetensors")
+    monkeypatch.setenv("HOME", str(SHIPPED["pictures"].parent))
+    assert wiw.policy("recogniser", weights="~/pictures.safetensors").file == SHIPPED["pictures"]
 
 
 @pytest.mark.parametrize("name", ["pictures", "extents"])

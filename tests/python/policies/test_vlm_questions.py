@@ -424,6 +424,8 @@ def test_an_answer_is_looked_at_again_where_straight_steps_are_imagined(two_room
     policy = make_policy(Script(command(landmark=1, answer="red")), imagined="straight", longest_route=50)
     decision = decide(two_rooms, policy, "copy")
     assert len(decision.actions) <= steering.LOOK and decision.answer.final and decision.chosen == 0
+    policy = make_policy(Script(command(landmark=1, answer="red")), longest_route=50)
+    assert len(decide(two_rooms, policy, horizon=2).actions) == 2, "no more than a plan may have"
 
 
 def test_a_reviser_may_only_choose(two_rooms: str) -> None:

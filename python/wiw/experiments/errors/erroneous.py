@@ -109,7 +109,13 @@ class Erroneous(ModelImaginer):
                 f"error '{self.error}' moves the camera in the episode's world: expected an environment of "
                 f"wiw.envs.NavigationEnv, got {type(env).__name__}; run it with wiw.evaluate"
             )
-        return WorldFork(fork, env.state.world, env.task.motion == "slide")
+        world = env.state.world
+        if fork.renderer is not world.renderer.core:
+            raise ArgumentError(
+                f"error '{self.error}' acts in the scene of the episode, but its future is imagined in another one, as "
+                "placebo-swapped does: expected episodes of one scene, or blur, noise, tint, resolution or flicker"
+            )
+        return WorldFork(fork, world, env.task.motion == "slide")
 
 
 class MisplacedImagination(ImaginationWrapper):

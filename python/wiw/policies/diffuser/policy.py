@@ -56,7 +56,7 @@ class Diffuser(Policy):
     default_revision = "scripted"
 
     def __init__(self, weights: str | Path | None = None, steps: int = STEPS) -> None:
-        if not 1 <= steps <= 100:
+        if not isinstance(steps, int) or not 1 <= steps <= 100:
             raise ArgumentError(f"diffuser: expected 1 to 100 steps, got {steps}")
         require_torch()
         from wiw.policies.diffuser.weights import load

@@ -64,7 +64,8 @@ class Explorer(Policy):
             task's.
 
     Raises:
-        ArgumentError: a labeller that needs the simulator's instance ids.
+        ArgumentError: a labeller that needs the simulator's instance ids, or an option that is no number, or none of
+            its range.
         DependencyError: torch is not installed.
         WeightsError: the weights cannot be read.
     """
@@ -82,6 +83,9 @@ class Explorer(Policy):
         budget: int | None = None,
         calibrated: bool = True,
     ) -> None:
+        _check_options(
+            {"sure": sure, "imagination": imagination, "path": path, "affinity": affinity}, budget, calibrated
+        )
         self.labeller: Labeller = LABELLERS.make(perception)
         if "ids" in self.labeller.needs:
             raise ArgumentError(
@@ -289,6 +293,21 @@ class Explorer(Policy):
         budget = situation.goal.budget if self.budget is None else self.budget
         is_ending = budget is not None and budget - len(situation.executed) <= LAST_ACTIONS
         return bool(memory.belief.confidence >= self.sure or not memory.destinations or is_ending)
+
+
+def _check_options(numbers: Mapping[str, Any], budget: Any, calibrated: Any) -> None:
+    """Check the options of an explorer, which users give by name.
+
+    Raises:
+        ArgumentError: says which one, and what is expected.
+    """
+    for name, value in numbers.items():
+        if isinstance(value, bool) or not isinstance(value, int | float) or not np.isfinite(value):
+            raise ArgumentError(f"policy explorer: expected a number for {name}, got {value!r}")
+    if budget is not None and (isinstance(budget, bool) or not isinstance(budget, int) or budget < 1):
+        raise ArgumentError(f"policy explorer: expected a whole budget of at least 1, got {budget!r}")
+    if calibrated not in (True, False):
+        raise ArgumentError(f"policy explorer: expected true or false for calibrated, got {calibrated!r}")
 
 
 def _find_patches(mask: NDArray[np.bool_]) -> tuple[NDArray[np.intp], NDArray[np.intp], NDArray[np.intp]]:

@@ -75,7 +75,7 @@ class NavigatorOptions:
     def __post_init__(self) -> None:
         require_positive("policy navigator", self, "targets")
         for name, value in vars(self).items():
-            if value < 0 or (value == 0 and name in ("patience", "overlap")):
+            if not 0 <= value < np.inf or (value == 0 and name in ("patience", "overlap")):
                 least = "above 0" if name in ("patience", "overlap") else "of 0 or more"
                 raise ArgumentError(f"policy navigator: expected {name} {least}, got {value}")
         if not (self.doubt < 1 and self.commitment <= 1):

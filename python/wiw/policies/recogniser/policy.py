@@ -63,7 +63,8 @@ class Recognition(Policy):
         trust: deduction for each rank in the order of proposals, which is all that counts without a world model.
 
     Raises:
-        ArgumentError: no glimpses to remember or to view, or weights that are neither a name nor a file.
+        ArgumentError: no glimpses to remember or to view, deductions that are no numbers, or weights that are neither a
+            name nor a file.
         DependencyError: torch or safetensors is not installed.
         FileError: the weights cannot be read.
     """
@@ -94,9 +95,13 @@ class Recognition(Policy):
         turning: float = 0.05,
         trust: float = 0.3,
     ) -> None:
-        if min(remember, views) < 1:
+        if not all(isinstance(count, int) and count >= 1 for count in (remember, views)):
             raise ArgumentError(
                 f"policy recogniser: expected remember and views of at least 1, got {remember} and {views}"
+            )
+        if not all(isinstance(weight, int | float) and np.isfinite(weight) for weight in (lost, turning, trust)):
+            raise ArgumentError(
+                f"policy recogniser: expected numbers for lost, turning and trust, got {lost}, {turning} and {trust}"
             )
         self.file = _find_weights(weights)
         self.recogniser = Recogniser.load(self.file)
@@ -217,7 +222,7 @@ class Recognition(Policy):
 
 def _find_weights(weights: str | Path) -> Path:
     """Return the file of weights given by path or by the name of shipped ones."""
-    file = SHIPPED.get(str(weights), Path(weights))
+    file = SHIPPED.get(str(weights), Path(weights).expanduser())
     if not file.suffix and not file.exists():
         raise ArgumentError(
             f"policy recogniser: expected weights {' or '.join(SHIPPED)}, or a file of `wiw train recogniser`, got "

@@ -40,9 +40,11 @@ LISTS = ("itemize", "enumerate")
 PLAIN = ("ttfamily", "center", "flushleft", "quote", "small")
 """Environments whose content is text like any other."""
 INDENT = "   "
+ESCAPED = {**{mark: mark for mark in "$&%#_{}"}, **dict.fromkeys(" \n\t,;:", " "), **dict.fromkeys("!/-@", "")}
+"""What stands for a backslash and one of these: the character, a space of any width, or nothing that is seen."""
 _LIGATURES = {"---": "—", "--": "–", "``": '"', "''": '"', "~": " "}
 _TOKEN = re.compile(
-    r"(?P<comment>(?<!\\)%[^\n]*(?:\n[ \t]*)?)"
+    r"(?P<comment>%[^\n]*(?:\n[ \t]*)?)"
     r"|\\(?P<edge>begin|end)\s*\{(?P<environment>[A-Za-z*]+)\}(?:\[[^\]]*\])?"
     r"|(?P<newline>\\\\\*?(?:\[[^\]]*\])?|\\newline\b)"
     r"|\\(?P<skip>[vh]space)\*?\s*\{[^{}]*\}"
@@ -118,8 +120,10 @@ class _Writer:
             self._break()
         elif kind in ("space", "comment"):
             self._space(kind == "space")
+        elif kind == "escaped":
+            self._write_escaped(match["escaped"])
         elif kind not in ("skip", "math"):
-            self.lines[-1] += match["escaped"] or _LIGATURES.get(found, found)
+            self.lines[-1] += _LIGATURES.get(found, found)
 
     def text(self) -> str:
         """Return all lines; never two empty ones in a row."""
@@ -157,6 +161,11 @@ class _Writer:
             self._break(empty=True)
         elif command not in IGNORED:
             raise _UnknownLatexError(f"unknown command \\{command}; replace it by its meaning in your copy")
+
+    def _write_escaped(self, mark: str) -> None:
+        if mark not in ESCAPED:
+            raise _UnknownLatexError(f"unknown command \\{mark}; replace it by its meaning in your copy")
+        self.lines[-1] += ESCAPED[mark]
 
     def _close(self) -> None:
         if not self.closers:

@@ -35,9 +35,10 @@ TASKS = {"AR": "ar", "ImageNav": "imagenav", "A-EQA": "aeqa", "Manipulation": "m
 """First words of a box's title."""
 ROLES = {"answerer": "answerer", "low-level planner": "low_level_planner", "planner": "planner"}
 """Further words of it, the first that fits."""
-_BOX = re.compile(
-    r"\\begin\{tcolorbox\}(?P<options>\[.*?^\s*\]|\[[^\]]*\])(?P<body>.*?)\\end\{tcolorbox\}", re.S | re.M
-)
+_BRACED = r"\{(?:[^{}\\]|\\.|\{(?:[^{}\\]|\\.|\{[^{}]*\})*\})*\}"
+_OPTIONS = rf"\[(?:%[^\n]*\n|[^][{{}}\\%]|\\.|{_BRACED}|\[[^][]*\])*\]"
+"""Up to the bracket that closes them: others are in braces, in brackets or in remarks."""
+_BOX = re.compile(rf"\\begin\{{tcolorbox\}}(?P<options>{_OPTIONS})(?P<body>.*?)\\end\{{tcolorbox\}}", re.DOTALL)
 _COMMENT = re.compile(r"(?<!\\)%.*")
 _TITLE = re.compile(r"(?<![a-z])title\s*=\s*(?:\{(?P<braced>[^}]*)\}|(?P<bare>[^,\]\n]*))")
 _ANSWER_FORM = re.compile(

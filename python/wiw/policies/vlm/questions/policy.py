@@ -229,7 +229,7 @@ class QuestionVLM(VLM):
             walk = np.zeros(0, np.int8) if reply.problem else commands.parse_walk(reply.value)
             turn, way = steering.turn_to_view(command.view), steering.walk_in_view(command.view, walk, horizon)
         if command.answer:
-            way = plan = way[: steering.LOOK]
+            way = plan = way[: min(steering.LOOK, horizon)]
         elif situation.imagines and self.imagined == "straight":
             plan = steering.go_straight(turn, horizon)
         else:
