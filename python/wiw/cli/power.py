@@ -92,7 +92,7 @@ def power(
         print(plan_power(difference, settings))
         return 0
     usual = {"base": BASE, "losses": LOSSES, **settings, **own}
-    fitting = [points for points in USUAL if usual["base"] + points + usual["losses"] <= 100]
+    fitting = [points for points in USUAL if usual["base"] + points + usual["losses"] <= 100] or USUAL[:1]
     _print_table([plan_power(points, settings) for points in fitting], chance)
     return 0
 

@@ -60,7 +60,7 @@ def draw_scenes(
     Console().print(table)
     with atomic_file(out) as draft:
         kind = Image.registered_extensions().get(out.suffix.lower(), "PNG")
-        contact_sheet(rows, views, backend).save(draft, format=kind)
+        contact_sheet(rows, views, backend).save(draft, format=kind if kind in Image.SAVE else "PNG")
     print(f"\nsheet  {out}")
     return 0
 

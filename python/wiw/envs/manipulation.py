@@ -103,7 +103,7 @@ class ManipulationEnv(gymnasium.Env[dict[str, Any], NDArray[np.float64]], Env):
             ArgumentError: no finite pose [7] with a gripper from 0 to 1, nor, with `grid`, whole numbers [7]; or the
                 episode has ended; nothing has moved then.
         """
-        pose = np.asarray(action, np.float64) if self.grid is None else self.grid.decode(action)
+        pose = np.asarray(action) if self.grid is None else self.grid.decode(action)
         segment = self.run(pose[None])
         info: dict[str, Any] = {"key": segment.key, "refused": segment.refused}
         if segment.terminated or segment.truncated:
@@ -239,7 +239,10 @@ def check_poses(plan: ArrayLike) -> NDArray[np.float64]:
     Raises:
         ArgumentError: another shape, a value that is not finite, or a gripper outside [0, 1].
     """
-    poses = np.asarray(plan, np.float64)
+    try:
+        poses = np.asarray(plan, np.float64)
+    except (TypeError, ValueError):
+        raise ArgumentError(f"run: expected poses [K, 7], got {plan!r}") from None
     if poses.ndim != 2 or poses.shape[1] != 7 or not len(poses):
         raise ArgumentError(f"run: expected poses [K, 7], got {list(poses.shape)}")
     finite, open_by = np.isfinite(poses).all(axis=1), poses[:, 6]

@@ -198,7 +198,8 @@ class NavigationEnv(gymnasium.Env[dict[str, Any], int], Env):
 
     def instances(self) -> tuple[NDArray[np.uint32], Sequence[Mapping[str, Any]]]:
         """Return the true instance of each pixel of the panorama, uint32 [576, 1024], and the scene's table of them."""
-        return self._core.observe(["panorama_ids"])["panorama_ids"], self.state.world.scene.instances
+        scene = self.state.world.scene
+        return self._core.observe(["panorama_ids"])["panorama_ids"], scene.instances
 
     # -- privileged ----------------------------------------------------------------------------------------------------
 

@@ -43,8 +43,8 @@ class Sensors:
     def __post_init__(self) -> None:
         if unknown := [name for name in self.cameras if name not in CAMERAS]:
             raise ArgumentError(f"cameras: expected some of {', '.join(CAMERAS)}, got {', '.join(unknown)}")
-        if self.size < 1:
-            raise ArgumentError(f"size: expected at least one pixel, got {self.size}")
+        if not isinstance(self.size, int | np.integer) or self.size < 1:
+            raise ArgumentError(f"size: expected a whole number of pixels, at least one, got {self.size!r}")
 
     @property
     def names(self) -> tuple[str, ...]:

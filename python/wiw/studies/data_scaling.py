@@ -138,6 +138,7 @@ def data_scaling(
         )
     for name in settings.models:  # fails before anything takes time
         create_recipe(make_learner(name), settings, settings.clips, 0)
+    choose_sizes(settings.clips, settings.batch, settings.sizes)
     resolve(settings.decision_scenes)
     where = resolve_device(device)
     folder = Path(out)

@@ -196,8 +196,8 @@ def choose_sizes(largest: int, batch: int, count: int = 4) -> tuple[int, ...]:
     Raises:
         ArgumentError: too few clips for different sizes.
     """
-    whole = largest // batch * batch
-    sizes = [max(batch, round(size / batch) * batch) for size in np.geomspace(max(whole, 1) / SPAN, whole, count)]
+    whole = max(1, largest // batch * batch)
+    sizes = [max(batch, round(size / batch) * batch) for size in np.geomspace(whole / SPAN, whole, count)]
     if len(set(sizes)) < count:
         more = f"{SPAN * batch} or more, or " if whole < SPAN * batch else ""
         raise ArgumentError(

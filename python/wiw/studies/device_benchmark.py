@@ -123,12 +123,14 @@ def benchmark_device(
         progress: called with a description before each measurement.
 
     Raises:
-        ArgumentError: an unknown network, or a number below 1.
+        ArgumentError: an unknown network, a number below 1, or seconds below 0.
         FileError: there is no such scene.
     """
     for name, numbers in (("views", views), ("rows", rows)):
         if numbers is not None and (not numbers or min(numbers) < 1):
             raise ArgumentError(f"bench: expected {name} of at least 1, got {list(numbers)}")
+    if not seconds >= 0:
+        raise ArgumentError(f"bench: expected seconds of at least 0, got {seconds}")
     if networks:
         with suppress(ModuleNotFoundError):  # torch, which is then said not to be installed
             _require_networks(networks)

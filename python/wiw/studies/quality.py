@@ -396,7 +396,7 @@ def _compare_with_truth(
     if lpips is not None:
         measures = {CONTROL_BY_LPIPS: lambda a, b: 1 - _measure_distance(lpips, a, b), **measures}
     for name, measure in measures.items():
-        card = ScorerCard("truth", "1", "Apache-2.0", {name: None})
+        card = ScorerCard("truth", "2", "Apache-2.0", {name: None})
         total = sum(key in arm.true for arm in arms for key in arm.frames)
         for arm in arms:
             arm.scores[name] = _compare_arm(arm, stores[arm.log.path], card, name, measure)
@@ -406,7 +406,8 @@ def _compare_with_truth(
 
 
 def _is_panorama(frame: Image) -> bool:
-    return frame.shape[1] == 2 * frame.shape[0]
+    """Return whether a frame is a panorama, which need not be twice as wide as it is high; other views are square."""
+    return frame.shape[1] > 1.6 * frame.shape[0]
 
 
 def _measure_similarity(frame: Image, true: Image) -> float:

@@ -49,8 +49,17 @@ _RUN_KEYS = ("task", "task_options", "settings", "agent", "arms", "compare", "pl
 _AGENT_KEYS = tuple(field.name for field in fields(AgentRecipe) if field.name != "observers")
 _OWN_SETTINGS = ("out", "resume", "progress", "workers", "shard")
 """Settings of a run that the study decides."""
-_QUALITY_KEYS = ("scorers", "frames", "lpips", "deadline")
 _VARIABLE = re.compile(r"\{(\w+)\}")
+
+
+@dataclass(frozen=True)
+class _QualityOptions:
+    """Options of `wiw.quality` that a study may give."""
+
+    scorers: tuple[str, ...]
+    frames: int
+    lpips: str | None
+    deadline: float
 
 
 @dataclass(frozen=True)
@@ -141,7 +150,7 @@ def load_study(study: str | Path, variables: Mapping[str, Any] | None = None, sm
     filled = {name: _substitute(content.get(name), values, f"{path}: {name}") for name in _KEYS[:3] + _KEYS[5:]}
     runs = _require_mapping(filled["runs"], f"{path}: runs")
     shared = _require_mapping(filled["settings"] or {}, f"{path}: settings")
-    made = tuple(_read_run(name, each, shared, f"{path}: runs: {name}") for name, each in runs.items())
+    made = tuple(_read_run(str(name), each, shared, f"{path}: runs: {name}") for name, each in runs.items())
     if not made:
         raise ArgumentError(f"{path}: runs: expected at least one run by name, got none")
     title, text = str(filled["title"] or path.stem), str(filled["text"] or "")
@@ -185,7 +194,8 @@ def _read_run(name: str, content: Any, shared: Mapping[str, Any], where: str) ->
     plots = _require_names(content.get("plots", ["success"]), f"{where}: plots")
     require_known(plots, PLOTS, f"{where}: plots")
     quality = _require_mapping(content.get("quality") or {}, f"{where}: quality") if "quality" in plots else None
-    require_known(quality or {}, _QUALITY_KEYS, f"{where}: quality")
+    if quality is not None:
+        quality = read_values(_QualityOptions, quality, f"{where}: quality")
     settings = {**shared, **_require_mapping(content.get("settings") or {}, f"{where}: settings")}
     known = [field.name for field in fields(RunConfig) if field.name not in _OWN_SETTINGS]
     require_known(settings, known, f"{where}: settings")

@@ -199,9 +199,15 @@ def _check_frame(robot: Robot) -> None:
         for joint in robot.finger_joints:
             positions[description.joint_index(joint)] = limits[end][description.joint_index(joint)]
         ends.append(description.forward_kinematics(positions))
+    hand = description.link_index(robot.hand)
+    if not np.allclose(*(np.linalg.solve(end[hand], end[robot.tool_index]) for end in ends)):
+        raise ArgumentError(
+            f"robot {description.name}: expected '{robot.tcp}' to be fixed to the hand, '{robot.hand}', but it moves "
+            "with a finger; choose another with robot_tcp=LINK"
+        )
     tip = np.linalg.inv(ends[0][robot.tool_index])
     way = tip[:3, :3] @ (ends[1] - ends[0])[description.link_index(robot.fingers[0]), :3, 3]
-    behind = (tip @ ends[0][description.link_index(robot.hand)])[2, 3]
+    behind = (tip @ ends[0][hand])[2, 3]
     if abs(way[1]) < 0.99 * np.linalg.norm(way) or not np.linalg.norm(way) or behind >= 0:
         raise ArgumentError(
             f"robot {description.name}: expected '{robot.tcp}' as a frame between the finger tips with z out of the "

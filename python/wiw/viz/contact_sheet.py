@@ -44,7 +44,8 @@ def contact_sheet(worlds: Sequence[Any], views: int = 2, backend: str = "auto") 
 
 def _row(world: Any, views: int, backend: str) -> Image.Image:
     places = _spread_places(world, views)
-    pictures = [_from_above(world, float(places[0][1]), backend)] + [_panorama(world, place) for place in places]
+    pictures = [_from_above(world, float(places[0][1]), backend)]
+    pictures += [_panorama(world, place) for place in places[:views]]
     row = Image.new("RGB", (sum(p.width + GAP for p in pictures) - GAP, CAPTION + HEIGHT), PAPER)
     ImageDraw.Draw(row).text((0, 2), short_name(world.name), INK, ImageFont.load_default(16))
     left = 0
@@ -55,7 +56,9 @@ def _row(world: Any, views: int, backend: str) -> Image.Image:
 
 
 def _spread_places(world: Any, count: int) -> NDArray[np.float64]:
-    """Places on the largest floor, the first amid the others, each next one as far from those before as can be."""
+    """Return places on the largest floor, at least one: the first amid the others, each next one as far from those
+    before as can be.
+    """
     points = np.asarray(world.ground.put_down(world.navmesh.sample(256, 1, world.floor)), np.float64)
     chosen = [int(np.argmin(np.linalg.norm(points - np.median(points, axis=0), axis=1)))]
     while len(chosen) < max(1, count):

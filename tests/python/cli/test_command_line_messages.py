@@ -161,9 +161,11 @@ def test_what_is_no_number_is_refused_plainly(capsys: pytest.CaptureFixture[str]
         (["data", "stats", "nowhere", "--clip", "0"], "expected --clip of at least 1 frame, got 0"),
         (["compare", "a", "b", "--other", "warp"], "name one of the first with --arm"),
         (["power", "5", "--pilot", "a"], "or neither; got --pilot"),
+        (["power", "--base", "99"], "+5 points mean that 7 % are won, but the base fails only in 1 %"),
         (["study", "eror"], "data-scaling, errors, front-vs-panorama, models, vlm,"),
         (["collect", "decisions", "--out", str(FAKES)], "fakes.py already exists"),
         (["bench", "gpu", "--networks", "warp"], "no network 'warp'"),
+        (["bench", "gpu", "--seconds", "-1"], "expected seconds of at least 0, got -1"),
         (["run", "imagenav", "--episode-file", str(FAKES)], "fakes.py: expected an episode file, which is JSON"),
     ],
 )

@@ -157,8 +157,9 @@ def test_a_fork_moves_alone(env) -> None:
 
 
 def test_using_it_before_reset_says_so(env) -> None:
-    with pytest.raises(ArgumentError, match="reset"):
-        env.truth()
+    for use in (env.truth, env.instances):
+        with pytest.raises(ArgumentError, match="reset"):
+            use()
     with pytest.raises(ArgumentError, match="unknown rule"):
         wiw.make("ImageNav-v0", raduis=1.0)
 

@@ -152,7 +152,9 @@ def test_whole_numbers_are_the_grids_poses() -> None:
     ("options", "said"),
     [
         ({"cameras": ["ceiling"]}, "front, left_shoulder, right_shoulder, wrist, got ceiling"),
-        ({"size": 0}, "one pixel"),
+        ({"size": 0}, "at least one, got 0"),
+        ({"size": (480, 480)}, r"size: expected a whole number of pixels, .* got \(480, 480\)"),
+        ({"size": 48.5}, "a whole number of pixels, .* got 48.5"),
     ],
 )
 def test_senses_that_there_are_not(options: dict[str, Any], said: str) -> None:
@@ -173,6 +175,8 @@ def test_senses_that_there_are_not(options: dict[str, Any], said: str) -> None:
         (POSE, r"\[K, 7\], got \[7\]"),
         ([POSE[:6]], r"got \[1, 6\]"),
         (np.empty((0, 7)), r"got \[0, 7\]"),
+        ([["ahead"] * 7], r"expected poses \[K, 7\], got \[\['ahead'"),
+        ([POSE, POSE[:6]], r"expected poses \[K, 7\]"),
     ],
 )
 def test_a_plan_that_is_none_moves_nothing(plan: Any, said: str) -> None:

@@ -268,6 +268,9 @@ def test_sizes_are_whole_batches_over_two_orders_of_magnitude() -> None:
     assert choose_sizes(12_800, 16) == (128, 592, 2752, 12_800)
     with pytest.raises(ArgumentError, match=r"60 clips are too few for 4 sizes .* expected 1600 or more, or fewer"):
         choose_sizes(60, 16)
+    for few in (10, -5):
+        with pytest.raises(ArgumentError, match=f"{few} clips are too few"):
+            choose_sizes(few, 16)
     with pytest.raises(ArgumentError, match=r"3200 clips are too few for 20 sizes .*; expected fewer --sizes"):
         choose_sizes(3200, 16, 20)
 
@@ -546,6 +549,7 @@ def test_decisions_in_scenes_that_are_trained_on_are_refused(dataset: Path) -> N
     ("changes", "said"),
     [
         ({"size": (24, 48)}, "size: expected a height of a multiple of 16"),
+        ({"clips": 60}, "60 clips are too few for 4 sizes"),
         ({"decision_scenes": "nowhere.obj"}, "nowhere.obj: no such file"),
     ],
 )
@@ -574,6 +578,7 @@ def test_a_dataset_without_depth_is_refused(dataset: Path, tmp_path: Path) -> No
 
 
 def test_without_a_dataset_it_collects_its_own(two_rooms: str, tmp_path: Path, monkeypatch: Any) -> None:
+    monkeypatch.setattr(planning, "SPAN", 9)
     monkeypatch.setattr("wiw.studies.data_scaling.SMALL_SCENES", two_rooms)
     monkeypatch.setattr("wiw.studies.data_scaling.SMALL_SIZE", (32, 64))
     seen: list[tuple[Any, ...]] = []

@@ -28,6 +28,8 @@ from wiw.cli import main
 from wiw.errors import ArgumentError, ScorerError, StoreError, WeightsError
 from wiw.metrics import colourfulness, paper_quality, sharpness, ssim
 from wiw.metrics.metric import SUCCESS
+from wiw.policies.base import FrameSpec
+from wiw.policies.matcher.policy import Matcher
 from wiw.runs.config import RunConfig
 from wiw.runs.frame_scores import FrameScores
 from wiw.runs.imagined_frames import FrameKey, list_frames, read_frames, sample_frames
@@ -395,6 +397,33 @@ def test_controllability_is_one_less_lpips_where_its_weights_are(run: Path, monk
     assert lines["oracle"] == 1 > lines["warp"] > lines["copy"]
     assert set(seen) == {(4, 128, 128, 3)}  # four views of each panorama
     forget_scores(run)
+
+
+class WideMatcher(Matcher):
+    """Looks at panoramas in the shape in which the agent observes them."""
+
+    frames = FrameSpec("panorama", (72, 128))
+
+    def score(self, situations, plans, rollouts):
+        return [np.zeros(len(own)) for own in plans]
+
+
+def test_panoramas_of_any_shape_are_compared_as_panoramas(
+    two_rooms: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    arms = {name: wiw.Agent("matcher", name, WideMatcher(), candidates=2) for name in ("copy", "oracle")}
+    config = RunConfig(episodes=1, seed=0, out=tmp_path / "wide", progress=False, keep_images="all")
+    run_arms("imagenav", arms, config=config, scenes=two_rooms, decisions=1)
+    seen: list[tuple[int, ...]] = []
+    monkeypatch.setattr("wiw.studies.quality.Lpips", lambda _: lambda a, b: (seen.append(a.shape), np.zeros(len(a)))[1])
+    found = wiw.quality(tmp_path / "wide", frames=2, lpips="auto").table
+    with wiw.load_run(tmp_path / "wide").store as store:
+        places = {arm: list_frames(store, arm) for arm in arms}
+        keys = sample_frames(set.intersection(*map(set, places.values())), 2)
+        frames = {arm: dict(read_frames(store, own, keys)) for arm, own in places.items()}
+    own = [ssim(frames["copy"][key], frames["oracle"][key], weights="latitude") for key in keys]
+    assert {key.size for key in keys} == {(160, 284)} and set(seen) == {(4, 128, 128, 3)}
+    assert next(line for line in found.arms if line.arm == "copy").scores["SSIM"].value == pytest.approx(np.mean(own))
 
 
 def test_real_views_turned_are_not_scored(run: Path) -> None:

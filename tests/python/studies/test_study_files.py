@@ -120,6 +120,11 @@ def test_variables_are_filled_in_and_arms_are_merged(own: Path) -> None:
     assert parse_variables(["a=1", "b=[1, 2]", "c=x", "d="]) == {"a": 1, "b": [1, 2], "c": "x", "d": None}
 
 
+def test_a_run_may_be_named_by_a_number(own: Path) -> None:
+    own.write_text(own.read_text().replace("  here:", "  2024:"))
+    assert [run.name for run in load_study(own).runs] == ["2024"]
+
+
 def test_a_pair_of_arms_named_by_text_says_which_is_unknown(tmp_path: Path) -> None:
     file = tmp_path / "own.yaml"
     run = {"task": "imagenav", "agent": {"policy": "matcher"}, "arms": "none,copy"}
@@ -150,6 +155,17 @@ def test_a_pair_of_arms_named_by_text_says_which_is_unknown(tmp_path: Path) -> N
         ("[[around, front], [left-out, front]]", "[around, front]", "compare: expected pairs of arms"),
         ("[success, rollouts]", "[succes]", "plots: unknown name 'succes'.*Did you mean success"),
         ("[success, rollouts]", "true", "plots: expected a list of names, got True"),
+        (
+            "[success, rollouts]",
+            "[quality]\n    quality: {scorers: laion}",
+            r"here: quality: scorers: expected \[text, \.\.\.\], got 'laion'",
+        ),
+        (
+            "[success, rollouts]",
+            "[quality]\n    quality: {frames: many}",
+            "quality: frames: expected a whole number, got 'many'",
+        ),
+        ("[success, rollouts]", "[quality]\n    quality: {frame: 8}", "quality: unknown name 'frame'.*mean frames"),
         ("keep_images: 0", "keep_image: 0", "settings: unknown name 'keep_image'.*Did you mean keep_images"),
         ("seed: 3", "out: there", "settings: unknown name 'out'"),
         ("seed: 3", "seed: three", "settings: seed: expected a whole number or null, got 'three'"),

@@ -118,6 +118,8 @@ def test_a_link_may_be_named_as_the_tool(other: Path) -> None:
         load_robot(other, "acme_elbow")
     with pytest.raises(ArgumentError, match="moving along y"):
         load_robot(other, "acme_link8")  # turned by 45 degrees from the hand
+    with pytest.raises(ArgumentError, match="'acme_leftfinger' to be fixed to the hand, 'acme_hand', but it moves"):
+        load_robot(other, "acme_leftfinger")
 
 
 @pytest.mark.parametrize("damage", [lambda file: file.unlink(), lambda file: file.write_bytes(b"\0" * 200)])

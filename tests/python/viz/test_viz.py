@@ -3,14 +3,17 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from PIL import Image
 
 import wiw
+from wiw.cli import main
 from wiw.errors import ArgumentError
 from wiw.nav import NavMesh
 from wiw.render import Renderer
 from wiw.runs.scene_map import HFOV_DEG, draw, look_down, to_pixels
 from wiw.scenes import load
 from wiw.types import ArmObservation, Decision, Goal, Key, Observation, Proposal, Rollout
+from wiw.viz.contact_sheet import GAP, HEIGHT
 
 
 def decision(frames=(5, 60, 60, 3), observation=True):
@@ -114,3 +117,12 @@ f 5 8 7 6
     house = load(roofed)
     image, _ = draw(house, NavMesh.build(house), 0.0, "cpu")
     assert {tuple(color) for color in image.reshape(-1, 4)} == {(236, 233, 226, 255), (0, 0, 0, 0)}
+
+
+def test_a_sheet_has_as_many_panoramas_as_asked_for_in_any_file(two_rooms, tmp_path, capsys):
+    widths = []
+    for views in (0, 1, 2):
+        sheet = tmp_path / f"{views}.psd"  # which Pillow reads, but does not write
+        assert main(["scenes", two_rooms, "--views", str(views), "--backend", "cpu", "--out", str(sheet)]) == 0
+        widths.append(Image.open(sheet).width)
+    assert np.diff(widths).tolist() == [HEIGHT * 16 // 9 + GAP] * 2
