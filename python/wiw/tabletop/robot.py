@@ -200,7 +200,8 @@ def _check_frame(robot: Robot) -> None:
             positions[description.joint_index(joint)] = limits[end][description.joint_index(joint)]
         ends.append(description.forward_kinematics(positions))
     hand = description.link_index(robot.hand)
-    if not np.allclose(*(np.linalg.solve(end[hand], end[robot.tool_index]) for end in ends)):
+    closed, opened = (np.linalg.solve(end[hand], end[robot.tool_index]) for end in ends)
+    if not np.allclose(closed, opened):
         raise ArgumentError(
             f"robot {description.name}: expected '{robot.tcp}' to be fixed to the hand, '{robot.hand}', but it moves "
             "with a finger; choose another with robot_tcp=LINK"
