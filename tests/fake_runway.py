@@ -30,6 +30,7 @@ class FakeRunway(http.server.ThreadingHTTPServer):
         self.looks: list[int] = []
         self.plan = ("PENDING", "THROTTLED", "RUNNING", "SUCCEEDED")
         self.broken_videos = 0
+        self.cut_videos = 0
         self.refusals: list[int] = []
         self.lock = threading.Lock()
 
@@ -90,15 +91,18 @@ class Handler(http.server.BaseHTTPRequestHandler):
         elif self.server.broken_videos:
             self.server.broken_videos -= 1
             self._answer(200, b"no video", "video/mp4")
+        elif self.server.cut_videos:
+            self.server.cut_videos -= 1
+            self._answer(200, self.server.video(task), "video/mp4", lost=16)
         else:
             self._answer(200, self.server.video(task), "video/mp4")
 
-    def _answer(self, status: int, content: bytes, kind: str = "application/json") -> None:
+    def _answer(self, status: int, content: bytes, kind: str = "application/json", lost: int = 0) -> None:
         self.send_response(status)
         self.send_header("Content-Type", kind)
         self.send_header("Content-Length", str(len(content)))
         self.end_headers()
-        self.wfile.write(content)
+        self.wfile.write(content[: len(content) - lost])
 
     def log_message(self, *_: Any) -> None:
         pass

@@ -68,6 +68,11 @@ class Worker(threading.Thread):
 
 
 def _refuse(error: BaseException) -> Refusal:
+    try:
+        said = str(error)
+    except Exception as fault:  # the thread has to go on
+        said = f"its text cannot be had ({type(fault).__name__})"
+    kind, text = "raised", f"{type(error).__name__}: {' '.join(said.split())}"
     if isinstance(error, ContractError):
-        return Refusal(b"", error.kind, str(error))
-    return Refusal(b"", "raised", f"{type(error).__name__}: {' '.join(str(error).split())}")
+        kind, text = error.kind, said
+    return Refusal(b"", kind, text.encode(errors="backslashreplace").decode())  # a file's name need not be UTF-8

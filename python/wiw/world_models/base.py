@@ -150,12 +150,14 @@ def accepts(
     needs = (needs,) if isinstance(needs, str) else needs
     for need in needs:
         _check("needs", need, NEEDS)
-    if not isinstance(size, Sequence) or len(size) != 2 or not all(_is_whole(side) and side >= 1 for side in size):
+    if not _is_size(size):
         raise ArgumentError(f"accepts: expected size (height, width) in pixels, got {size!r}")
     if not _is_whole(frames) or frames < 0 or frames == 1:
         raise ArgumentError(f"accepts: frames includes the observation: expected 0 (any) or at least 2, got {frames!r}")
     if not _is_whole(best_batch) or best_batch < 1:
         raise ArgumentError(f"accepts: expected best_batch of at least 1, got {best_batch!r}")
+    if null_first and space == GRIPPER_POSES:
+        raise ArgumentError("accepts: null_first is for primitives: plans of poses begin with that of frame 0")
     _check_template(template, space)
     history = _check_history(history, needs)
     size = (int(size[0]), int(size[1]))
@@ -164,10 +166,10 @@ def accepts(
         space,
         view,
         size,
-        frames,
+        int(frames),
         tuple(needs),
         causal,
-        best_batch,
+        int(best_batch),
         _check_vocabulary(vocabulary, space),
         null_first,
         template,
@@ -200,16 +202,27 @@ def _check_vocabulary(vocabulary: Any, space: str) -> dict[int, Any] | GripperVo
             f"accepts: expected vocabulary as a map from primitives to the model's own, got {type(vocabulary).__name__}"
         )
     own = {int(parse_action(key)): value for key, value in vocabulary.items()}
+    for key, value in vocabulary.items():
+        if not _is_number_or_vector(value):
+            raise ArgumentError(f"accepts: vocabulary: expected a number or a vector for {key}, got {value!r}")
     to_controls(list(own), own)
     return own
 
 
-def _check_smallest(smallest: Sequence[int] | None, size: tuple[int, int], view: View) -> tuple[int, int] | None:
+def _is_number_or_vector(value: Any) -> bool:
+    try:
+        array = np.asarray(value)
+    except ValueError:  # of rows of different lengths
+        return False
+    return array.ndim <= 1 and array.dtype.kind in "biuf"
+
+
+def _check_smallest(smallest: Any, size: tuple[int, int], view: View) -> tuple[int, int] | None:
     if smallest is None:
         return None
     if view != "panorama":
         raise ArgumentError("accepts: smallest is for panoramas; a perspective model has only one size")
-    if len(smallest) != 2 or not all(1 <= least <= most for least, most in zip(smallest, size, strict=True)):
+    if not _is_size(smallest) or not all(least <= most for least, most in zip(smallest, size, strict=True)):
         raise ArgumentError(f"accepts: expected smallest (height, width) of at most {size} pixels, got {smallest}")
     return int(smallest[0]), int(smallest[1])
 
@@ -227,6 +240,10 @@ def _check_history(history: int | None, needs: Sequence[str]) -> int:
             f"1, got {history!r}"
         )
     return int(history)
+
+
+def _is_size(value: Any) -> bool:
+    return isinstance(value, Sequence) and len(value) == 2 and all(_is_whole(side) and side >= 1 for side in value)
 
 
 def _is_whole(value: Any) -> bool:

@@ -122,7 +122,10 @@ def test_the_nearest_size_of_the_range_is_asked_for(asked, size):
 
 @pytest.mark.parametrize(
     "declared",
-    [{"smallest": (0, 10)}, {"smallest": (97, 10)}, {"smallest": (10,)}, {"smallest": (9, 9), "view": "perspective"}],
+    [
+        *({"smallest": smallest} for smallest in ((0, 10), (97, 10), (10,), 10, (9.5, 9))),
+        {"smallest": (9, 9), "view": "perspective"},
+    ],
 )
 def test_a_range_that_is_none_is_refused(declared):
     with pytest.raises(ArgumentError, match="smallest"):

@@ -342,7 +342,10 @@ def test_models_are_refused_that_ask_for_what_nobody_gives() -> None:
         ({"control": "action", "vocabulary": {"jump": 1}}, "unknown action 'jump'"),
         ({"control": "action", "vocabulary": {7: 1}}, "unknown action 7"),
         ({"control": "action", "vocabulary": {1: [1, 0], 2: [1]}}, "one width"),
+        ({"control": "action", "vocabulary": {"forward": "w"}}, "a number or a vector for forward, got 'w'"),
+        ({"control": "action", "vocabulary": {"forward": [[1.0]]}}, "a number or a vector for forward"),
         ({"control": "action", "vocabulary": GripperVocabulary()}, "map from primitives"),
+        ({"control": "action", "space": "pose7", "null_first": True}, "null_first is for primitives"),
         ({"control": "action", "space": "pose7", "vocabulary": {1: 1}}, "GripperVocabulary"),
         ({"control": "action", "space": "pose7", "vocabulary": GripperVocabulary("roll")}, "roll"),  # type: ignore[arg-type]
     ]:

@@ -239,6 +239,30 @@ def test_a_row_that_the_model_cannot_do_fails_alone():
         assert len(model.rows) == before and [2] in model.rows
 
 
+def test_an_error_whose_words_are_not_utf_8_is_an_answer_too():
+    def act(observations):
+        raise FileNotFoundError("no file 'caf\udce9.png'")
+
+    with remote(Plain(act)) as (client, _), answer_deadline(20), pytest.raises(RemoteError, match="caf") as caught:
+        ask(client, 1)
+    assert caught.value.kind == "raised" and str(caught.value) == r"FileNotFoundError: no file 'caf\udce9.png'"
+
+
+def test_an_error_without_words_does_not_end_the_server():
+    class SpeechlessError(Exception):
+        def __str__(self):
+            raise KeyError("words")
+
+    def act(observations):
+        if (observations.image == 0).all():
+            raise SpeechlessError
+
+    with remote(Plain(act)) as (client, _), answer_deadline(20):
+        with pytest.raises(RemoteError, match=r"SpeechlessError: its text cannot be had \(KeyError\)"):
+            ask(client, 1)
+        assert ask(client, 1, start=1).shape == (1, 6, *SIZE, 3)
+
+
 def test_a_row_that_shows_another_place_fails_alone():
     """The others may be another client's."""
 

@@ -125,6 +125,7 @@ def test_equal_questions_have_equal_ids_and_others_do_not():
         accepts("trajectory", "perspective", frames=14, needs=("depth", "history"), history=7, causal=True),
         accepts("action", vocabulary={1: [0.5, -1.0], 2: np.array([0.0, 1.0])}, null_first=True, best_batch=3),
         accepts("viewpoint", cacheable=True),
+        accepts("image", frames=np.int64(14), best_batch=np.int64(3)),
         accepts("text", size=(64, 128), template=TextTemplate("Go: {actions}", separator=" - ", merge_runs=True)),
         accepts("action", vocabulary={"forward": 3, "turn_left": 1, "turn_right": 2}),
         accepts("text", "perspective", space="pose7", template=GripperTextTemplate("Do {actions}", "go to {x}")),

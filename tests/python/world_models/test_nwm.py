@@ -16,7 +16,7 @@ from hypothesis import strategies as st
 import wiw
 from wiw import action
 from wiw.action import FORWARD, STOP, TURN_LEFT, TURN_RIGHT
-from wiw.errors import ArgumentError, WeightsError
+from wiw.errors import ArgumentError, ContractError, WeightsError
 from wiw.types import Conditioning, Control, Goal, History, Key, Observation, Proposal
 from wiw.world_models.nwm.context import nearest_frames
 from wiw.world_models.nwm.motion import motions, normalise_steps
@@ -248,6 +248,14 @@ def test_frames_follow_actions_and_seeds_whatever_the_batch(model: NWM) -> None:
     other = model.rollout(Conditioning(same), *changed)
     assert (other[0, 1] != other[1, 1]).any() and (other[0, 1] != other[2, 1]).any()
     assert (other[0, 1] != other[0, 2]).any()
+
+
+def test_nan_is_no_picture(weights: Path) -> None:
+    model = NWM(weights=str(weights), steps=4, device="cpu")
+    next(model._network.parameters()).data.fill_(float("nan"))
+    with pytest.raises(ContractError, match="NaN in float32") as breach:
+        model.rollout(observations(1), controls([FORWARD]), np.zeros(1, np.uint64))
+    assert breach.value.kind == "nan"
 
 
 def test_history_is_the_context_where_there_is_one(model: NWM) -> None:

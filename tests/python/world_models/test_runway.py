@@ -117,6 +117,15 @@ def test_a_broken_download_costs_no_second_order(service, made):
     assert len(service.orders) == 1
 
 
+def test_a_video_that_was_cut_short_on_its_way_is_not_taken_for_a_shorter_one(service, made):
+    service.cut_videos = 1
+    model = made()
+    with pytest.raises(InfrastructureError, match="its last 16 bytes did not come"):
+        rollout(model)
+    rollout(model)
+    assert len(service.orders) == 1
+
+
 @pytest.mark.parametrize(("refusal", "said"), [(401, "RUNWAYML_API_SECRET is refused"), (400, "BadRequestError")])
 def test_refusals_are_said(refusal, said, service, made):
     service.refusals = [refusal]

@@ -265,6 +265,21 @@ def test_the_weights_tell_models_apart_and_their_place_does_not(made, world_mode
     assert made("ltx", weights=here).fingerprint() != first.fingerprint()
 
 
+def test_weights_behind_a_link_tell_models_apart(tmp_path):
+    found = set()
+    for name in ("one", "other"):
+        (tmp_path / name).mkdir()
+        (tmp_path / name / "diffusion_pytorch_model.safetensors").write_text(name)
+        pipeline = tmp_path / f"pipeline of {name}"
+        pipeline.mkdir()
+        (pipeline / "transformer").symlink_to(tmp_path / name)
+        found.add(digest_folder(pipeline))
+        (pipeline / "transformer").unlink()
+        shutil.copytree(tmp_path / name, pipeline / "transformer")
+        assert digest_folder(pipeline) in found
+    assert len(found) == 2
+
+
 def test_large_weights_are_told_apart_by_samples(tmp_path):
     size = 2 * SAMPLES * SAMPLE_BYTES
     weights = np.random.default_rng(0).integers(0, 256, size, np.uint8)

@@ -18,6 +18,7 @@ from wiw.world_models.base import Requirements, WorldModel, accepts
 from wiw.world_models.nwm.context import context_images
 from wiw.world_models.nwm.motion import SHIFT, motions
 from wiw.world_models.video.loading import versions
+from wiw.world_models.video.model import require_no_nan
 
 if TYPE_CHECKING:
     from torch import Tensor
@@ -132,7 +133,12 @@ class NWM(WorldModel):
     def rollout(
         self, observations: Conditioning, controls: Sequence[Control], seeds: NDArray[np.uint64]
     ) -> NDArray[np.uint8]:
-        """Imagine frames one by one; frames of padding are left black."""
+        """Imagine frames one by one; frames of padding are left black.
+
+        Raises:
+            DeviceMemoryError: the GPU's memory is full.
+            ContractError: the networks gave NaN.
+        """
         import torch
 
         steps = np.stack([motions(c.trajectory, self.spacing, self.rollout_convention) for c in controls])
@@ -194,7 +200,9 @@ class NWM(WorldModel):
             self.steps,
             self._place,
         )
-        return self._codec.decode(latents / self._codec.config.scaling_factor).sample.clamp(-1, 1)
+        pixels = self._codec.decode(latents / self._codec.config.scaling_factor).sample
+        require_no_nan(bool(pixels.isnan().any()), type(self).__name__, self.precision)
+        return pixels.clamp(-1, 1)
 
     def _encode(self, pixels: Tensor) -> Tensor:
         """Return latents [B, C, h, w]: the codec's mean."""

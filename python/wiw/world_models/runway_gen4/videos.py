@@ -4,6 +4,7 @@
 from __future__ import annotations
 
 import base64
+import http.client
 import tempfile
 import urllib.request
 from pathlib import Path
@@ -29,17 +30,20 @@ def fetch_video(url: str, size: tuple[int, int]) -> NDArray[np.uint8]:
     """Return all frames of the video at an address, uint8 [T, H, W, 3] in (height, width) `size`.
 
     Raises:
-        InfrastructureError: it cannot be downloaded, is larger than 256 MB, or is not a video.
+        InfrastructureError: it cannot be downloaded as a whole, is larger than 256 MB, or is not a video.
     """
     if not url.startswith(("https://", "http://")):
         raise InfrastructureError(f"RunwayGen4: expected the address of a video, got '{url[:80]}'")
     try:
         with urllib.request.urlopen(url, timeout=SECONDS) as answer:
             content = answer.read(MOST_BYTES + 1)
-    except OSError as error:
+            missing = answer.length or 0
+    except (OSError, http.client.HTTPException) as error:
         raise InfrastructureError(f"RunwayGen4: the video cannot be downloaded: {error}") from error
     if len(content) > MOST_BYTES:
         raise InfrastructureError(f"RunwayGen4: the video is larger than {MOST_BYTES >> 20} MB")
+    if missing:
+        raise InfrastructureError(f"RunwayGen4: the video cannot be downloaded: its last {missing} bytes did not come")
     return decode_video(content, size)
 
 

@@ -85,7 +85,8 @@ def digest_folder(folder: Path) -> str:
     Small ones count by content, weights by name, size and `SAMPLES` pieces of them.
     """
     total = blake2b(digest_size=20)
-    for path in sorted(p for p in folder.rglob("*") if p.is_file() and p.suffix in SUFFIXES):
+    parts = [folder, *(part for part in folder.iterdir() if part.is_symlink())]  # `rglob` enters no link to a folder
+    for path in sorted(p for part in parts for p in part.rglob("*") if p.is_file() and p.suffix in SUFFIXES):
         size = path.stat().st_size
         total.update(f"{path.relative_to(folder)} {size}\n".encode())
         with path.open("rb") as file:
