@@ -88,11 +88,21 @@ def _make_plain(value: Any) -> Any:
         value = value.tolist()
     if isinstance(value, float):
         return value if math.isfinite(value) else None
+    if isinstance(value, str):
+        return escape_surrogates(value)
     if isinstance(value, dict):
-        return {str(key): _make_plain(item) for key, item in value.items()}
+        return {escape_surrogates(str(key)): _make_plain(item) for key, item in value.items()}
     if isinstance(value, list | tuple):
         return [_make_plain(item) for item in value]
     return value
+
+
+def escape_surrogates(text: str) -> str:
+    r"""Return a text in which half a surrogate pair, which UTF-8 cannot carry, is written out, such as \udce9.
+
+    File names in other encodings and cut-off replies have them, and so do the errors that tell of them.
+    """
+    return text.encode(errors="backslashreplace").decode()
 
 
 def drop_folders(value: Any) -> Any:

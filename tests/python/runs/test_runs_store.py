@@ -108,6 +108,19 @@ def test_episodes_with_errors_are_pending_only_when_asked(run):
     assert run.pending("warp") == [0, 2] and run.pending("warp", retry_errors=True) == [0, 1, 2]
 
 
+def test_half_a_surrogate_pair_is_written_out(run):
+    """File names in other encodings and cut-off replies have them; none may end a run, or be lost."""
+    run.write(OutcomeRow("warp", EpisodeResult(1, "0001", "line/0", "error", error="no file caf\udce9.png")))
+    cut = replace(record(1, 0).decision, note="\ud83d")
+    run.write(decision_row("warp", replace(record(1, 0), decision=cut), with_images=False))
+    judge = JudgeRecord({"judge": "strict", "\udce9": 1})
+    run.add_judge(judge)
+    run.write_judged(JudgedRow(judge.digest, "warp", 1, {}, {}, "no mark \udce9", "judge/empty"))
+    (failed,) = run.recorded_outcomes()
+    assert failed["error"] == r"no file caf\udce9.png" and run.decisions()[0]["note"] == r"\ud83d"
+    assert run.judged_outcomes(judge.digest)["warp", 1]["error"] == r"no mark \udce9"
+
+
 @pytest.fixture
 def old_run(tmp_path, monkeypatch):
     """A run of two episodes with schema version 7, in which the second ended with an error, called "failed" then."""
