@@ -335,7 +335,7 @@ def read_lexicon(data: bytes, folder: Path) -> Any:
 
     (folder / "lexicon.json").write_bytes(data)
     body = {"semantic_scene_descriptor_instances": {"paths": {".json": ["lexicon.json"]}}}
-    return Dataset(folder / DATASET_CONFIG, body).class_names
+    return Dataset(folder / DATASET_CONFIG, body).read_class_names(None)
 
 
 def read_names(data: bytes, folder: Path) -> Any:

@@ -224,6 +224,8 @@ def test_the_command_imports_and_the_list_names_the_sets(
         ("ImageNav Planner Prompt (with WM Rollouts)", "imagenav/planner_imagined"),
         ("Architecture", None),
         ("Cooking Prompt", None),
+        ("ImageNav Answerer Prompt", None),
+        ("AR Low-Level Planner Prompt", None),
     ],
 )
 def test_titles_name_templates(title: str, name: str | None) -> None:

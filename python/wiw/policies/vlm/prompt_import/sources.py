@@ -117,7 +117,8 @@ def name_template(title: str) -> str | None:
     role = next((role for name, role in ROLES.items() if name in words), None)
     if task is None or role is None or "prompt" not in words:
         return None
-    return f"{task}/{role}{'_imagined' if 'rollouts' in words else ''}"
+    template = f"{task}/{role}{'_imagined' if 'rollouts' in words else ''}"
+    return template if template in FILES or template in VARIABLES else None
 
 
 def _require_new(found: Mapping[str, FoundPrompt], own: Mapping[str, FoundPrompt]) -> None:
