@@ -1,5 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Parse untrusted JSON; every defect raises a `ValueError` that describes it."""
+"""Parse untrusted JSON, of which every defect raises a `ValueError` that describes it, and make any text such that
+UTF-8 can carry it.
+"""
 
 from __future__ import annotations
 
@@ -45,3 +47,11 @@ def _items(value: Any) -> Iterable[Any]:
     if isinstance(value, dict):
         return value.values()
     return value if isinstance(value, list) else ()
+
+
+def escape_surrogates(text: str) -> str:
+    r"""Return a text in which half a surrogate pair, which UTF-8 cannot carry, is written out, such as \udce9.
+
+    File names in other encodings and cut-off replies have them, and so do the errors that tell of them.
+    """
+    return text.encode(errors="backslashreplace").decode()

@@ -15,6 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from wiw.errors import ArgumentError, ContractError, StoreError
+from wiw.json_text import escape_surrogates
 from wiw.runs.shapes import find_misfit
 from wiw.types import Answer, ArmObservation, DecisionRecord, Episode, EpisodeResult, Fidelity, TextAnswer, Truth
 
@@ -95,14 +96,6 @@ def _make_plain(value: Any) -> Any:
     if isinstance(value, list | tuple):
         return [_make_plain(item) for item in value]
     return value
-
-
-def escape_surrogates(text: str) -> str:
-    r"""Return a text in which half a surrogate pair, which UTF-8 cannot carry, is written out, such as \udce9.
-
-    File names in other encodings and cut-off replies have them, and so do the errors that tell of them.
-    """
-    return text.encode(errors="backslashreplace").decode()
 
 
 def drop_folders(value: Any) -> Any:

@@ -22,21 +22,13 @@ import wiw
 from wiw import benchmark
 from wiw.errors import ArgumentError, StoreError
 from wiw.file_systems import find_network
+from wiw.json_text import escape_surrogates
 from wiw.runs import configurations
 from wiw.runs.faults import explain_faults, find_remedy, write_resume_command
 from wiw.runs.judges import JudgedRow, JudgeRecord, apply_judge, find_judge
 from wiw.runs.migrations import OLDEST_READABLE, is_newer, migrate, show_as_current
 from wiw.runs.processes import describe_process
-from wiw.runs.rows import (
-    AgentRow,
-    DecisionRow,
-    LostRow,
-    OutcomeRow,
-    build_episode,
-    escape_surrogates,
-    to_episode_values,
-    to_json,
-)
+from wiw.runs.rows import AgentRow, DecisionRow, LostRow, OutcomeRow, build_episode, to_episode_values, to_json
 from wiw.runs.scratch import RECORDED, ScratchCopy
 from wiw.runs.shapes import EDITED, check_decision, check_types, parse_column
 from wiw.runs.shards import Shard
@@ -660,8 +652,7 @@ class RunStore:
 
     def write_judged(self, row: JudgedRow) -> None:
         """Write what a judge's marks make of an outcome; marks that exist already stay, an error is replaced."""
-        values = {name: getattr(row, name) for name in ("judge", "arm", "episode", "status", "kind")}
-        values |= {"error": escape_surrogates(row.error)}
+        values = {name: getattr(row, name) for name in ("judge", "arm", "episode", "status", "error", "kind")}
         values |= {name: to_json(dict(getattr(row, name))) for name in OUTCOME_JSON}
         names = ", ".join(values)
         changes = ", ".join(f"{name} = excluded.{name}" for name in ("status", "error", "kind", *OUTCOME_JSON))
@@ -669,7 +660,7 @@ class RunStore:
             connection.execute(
                 f"INSERT INTO judged ({names}) VALUES ({', '.join('?' for _ in values)}) "
                 f"ON CONFLICT (judge, arm, episode) DO UPDATE SET {changes} WHERE judged.status = 'error'",
-                tuple(values.values()),
+                _bind(values),
             )
 
     def write_agent(self, row: AgentRow) -> None:
@@ -938,8 +929,12 @@ def _format_now() -> str:
 
 def _insert(connection: sqlite3.Connection, table: str, values: dict[str, Any]) -> None:
     marks = ", ".join("?" for _ in values)
-    bound = (escape_surrogates(value) if isinstance(value, str) else value for value in values.values())
-    connection.execute(f"INSERT INTO {table} ({', '.join(values)}) VALUES ({marks})", tuple(bound))
+    connection.execute(f"INSERT INTO {table} ({', '.join(values)}) VALUES ({marks})", _bind(values))
+
+
+def _bind(values: Mapping[str, Any]) -> tuple[Any, ...]:
+    """Return the values of a row as SQLite takes them."""
+    return tuple(escape_surrogates(value) if isinstance(value, str) else value for value in values.values())
 
 
 _ADD = "ON CONFLICT (arm, name) DO UPDATE SET value = value + excluded.value"

@@ -11,6 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from wiw.errors import ContractError
+from wiw.json_text import escape_surrogates
 from wiw.serving.queue import Job, Queue
 from wiw.wire.messages import Refusal
 from wiw.wire.rows import Row, stack
@@ -75,4 +76,4 @@ def _refuse(error: BaseException) -> Refusal:
     kind, text = "raised", f"{type(error).__name__}: {' '.join(said.split())}"
     if isinstance(error, ContractError):
         kind, text = error.kind, said
-    return Refusal(b"", kind, text.encode(errors="backslashreplace").decode())  # a file's name need not be UTF-8
+    return Refusal(b"", kind, escape_surrogates(text))  # a file's name need not be UTF-8

@@ -173,6 +173,9 @@ def study_errors(
     """
     if lpips is not None:
         Lpips(lpips)  # fails before anything takes time
+    if distances is not None:
+        for task in settings.tasks:
+            _list_others(task, distances)  # likewise
     folder = Path(out)
     tables = []
     for task in settings.tasks:
@@ -245,13 +248,19 @@ def _list_parts(folder: Path) -> list[Path]:
     return sorted(path.parent for path in folder.glob("shard-*-of-*/run.sqlite"))
 
 
+def _list_others(task: str, study: str | Path) -> list[Path]:
+    """Return the folders of a task's runs in another study; a StoreError says that there are none."""
+    found = _list_parts(Path(study) / task)
+    if not found:
+        raise StoreError(f"errors: {study} has no run of {task}; name the folder of a study of this task")
+    return found
+
+
 def _list_measured(task: str, parts: Sequence[Path], distances: str | Path | None) -> list[Path]:
     """Return the folders of the runs that distances are taken from: a task's own, or those of another study."""
     if distances is None:
         return list(parts)
-    measured = _list_parts(Path(distances) / task)
-    if not measured:
-        raise StoreError(f"errors: {distances} has no run of {task}; name the folder of a study of this task")
+    measured = _list_others(task, distances)
     with RunStore.read(parts[0]) as own, RunStore.read(measured[0]) as other:
         for what, mine, theirs in (
             ("benchmark version", own.info["benchmark"], other.info["benchmark"]),

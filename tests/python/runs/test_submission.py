@@ -447,7 +447,7 @@ def test_an_array_of_slurm_jobs(tmp_path, slurm, capsys):
 STATES = (
     "JobID|State|NodeList\n100_0|FAILED|n\n100_1|COMPLETED|n\n300_0|RUNNING|n\n300_1|COMPLETED|n\n400_0|PREEMPTED|n\n"
 )
-"""What `sacct` says; not what became of 200_0. 400_0 may be requeued."""
+"""The answer of `sacct`, without what became of 200_0. 400_0 may be requeued."""
 
 
 @pytest.mark.parametrize(

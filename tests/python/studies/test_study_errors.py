@@ -338,3 +338,6 @@ def test_distances_of_few_episodes_go_with_the_success_of_many(two_rooms: str, t
         read_errors(tmp_path / "many", many, distances=tmp_path / "seeded")
     with pytest.raises(StoreError, match="has no run of imagenav; name the folder of a study"):
         read_errors(tmp_path / "many", many, distances=tmp_path)
+    with pytest.raises(StoreError, match="has no run of imagenav"):
+        study_errors(tmp_path / "new", many, distances=tmp_path)
+    assert not (tmp_path / "new").exists(), "nothing was run before"

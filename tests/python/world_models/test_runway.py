@@ -108,19 +108,14 @@ def test_the_budget_is_kept(service, made):
     assert len(service.orders) == 2
 
 
-def test_a_broken_download_costs_no_second_order(service, made):
-    service.broken_videos = 1
+@pytest.mark.parametrize(
+    ("fault", "said"), [("broken_videos", "not a video"), ("cut_videos", "its last 16 bytes did not come")]
+)
+def test_a_broken_download_costs_no_second_order(fault, said, service, made):
+    """Nor is a video that was cut short on its way taken for a shorter one."""
+    setattr(service, fault, 1)
     model = made()
-    with pytest.raises(InfrastructureError, match="not a video"):
-        rollout(model)
-    rollout(model)
-    assert len(service.orders) == 1
-
-
-def test_a_video_that_was_cut_short_on_its_way_is_not_taken_for_a_shorter_one(service, made):
-    service.cut_videos = 1
-    model = made()
-    with pytest.raises(InfrastructureError, match="its last 16 bytes did not come"):
+    with pytest.raises(InfrastructureError, match=said):
         rollout(model)
     rollout(model)
     assert len(service.orders) == 1

@@ -41,7 +41,7 @@ PLAIN = ("ttfamily", "center", "flushleft", "quote", "small")
 """Environments whose content is text like any other."""
 INDENT = "   "
 ESCAPED = {**{mark: mark for mark in "$&%#_{}"}, **dict.fromkeys(" \n\t,;:", " "), **dict.fromkeys("!/-@", "")}
-"""What stands for a backslash and one of these: the character, a space of any width, or nothing that is seen."""
+"""Text for a backslash and one of these: the character, a space of any width, or nothing that is seen."""
 _LIGATURES = {"---": "—", "--": "–", "``": '"', "''": '"', "~": " "}
 _TOKEN = re.compile(
     r"(?P<comment>%[^\n]*(?:\n[ \t]*)?)"
