@@ -1,6 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Parse untrusted JSON, of which every defect raises a `ValueError` that describes it, and make any text such that
-UTF-8 can carry it.
+"""Parse untrusted JSON, of which every defect raises a `ValueError` that describes it, tell values that are nested too
+deep, and make any text such that UTF-8 can carry it.
 """
 
 from __future__ import annotations
@@ -28,7 +28,7 @@ def parse_json(text: bytes | str) -> Any:
         value = json.loads(text)
         if _SURROGATE.search(text):
             json.dumps(value, ensure_ascii=False).encode()
-        deep = _is_deep(value)
+        deep = is_too_deep(value)
     except RecursionError:
         deep = True
     if deep:
@@ -36,7 +36,8 @@ def parse_json(text: bytes | str) -> Any:
     return value
 
 
-def _is_deep(value: Any) -> bool:
+def is_too_deep(value: Any) -> bool:
+    """Return whether a value has more than `MOST_LEVELS` lists and dicts in one another."""
     level = [value]
     for _ in range(MOST_LEVELS):
         level = [inner for outer in level for inner in _items(outer)]

@@ -34,6 +34,7 @@ from wiw.errors import InfrastructureError, find_error_class
 from wiw.isolation.connection import receive, send
 from wiw.isolation.failures import EndedError, ExitError, LateError, RaisedError
 from wiw.isolation.segments import SegmentPool, SharedSegment, place
+from wiw.json_text import MOST_LEVELS, is_too_deep
 from wiw.process_limits import find_memory_limit, make_child_environment
 
 STARTING = 120.0
@@ -181,8 +182,8 @@ class ChildProcess:
             reply = msgpack.unpackb(data, strict_map_key=False)
         except Exception as error:
             raise OSError(f"not valid msgpack: {error}") from None
-        if not isinstance(reply, dict):
-            raise OSError("expected a map")
+        if not isinstance(reply, dict) or is_too_deep(reply):
+            raise OSError(f"expected a map of at most {MOST_LEVELS} levels")
         return reply
 
     def _await_reply(self, until: float | None) -> None:

@@ -18,11 +18,14 @@ from contextlib import suppress
 from copy import deepcopy
 from multiprocessing import get_context
 from pathlib import Path
+from typing import Any
 
+import msgpack
 import numpy as np
 import pytest
 from bad_models import FAILING, FATAL, HARMLESS, SIZE, WAYS, imagine
 from locations import PYTHON_TESTS
+from readers import READERS
 
 import wiw
 from wiw.action import FORWARD
@@ -531,6 +534,17 @@ def test_a_small_dev_shm_is_enough(tmp_path):
 def test_a_child_names_no_other_things_than_errors(name: str) -> None:
     """What a child reports is data: only names of wiw's exceptions are followed."""
     assert type(_build_error({"type": name, "text": "no"})) is RaisedError
+
+
+@pytest.mark.parametrize("place", ["value", "error"])
+def test_a_reply_nested_too_deep_is_none(place: str, tmp_path: Path) -> None:
+    """Describing its value would otherwise end the run with a `RecursionError`."""
+    nested: Any = "no"
+    for _ in range(900):
+        nested = [nested]
+    reply = {"value": nested} if place == "value" else {"error": {"type": nested}}
+    with pytest.raises(OSError, match="32 levels"):
+        READERS["reply"].read(msgpack.packb(reply), tmp_path)
 
 
 SHADED = (
