@@ -34,20 +34,6 @@ const std::vector<Edit>& all_edits() {
   return kEdits;
 }
 
-Draft furnished(std::uint64_t seed, Split split) {
-  Draft draft;
-  draft.seed = seed;
-  draft.split = split;
-  draft.plan = make_floor_plan(seed, split);
-  draft.palette = make_palette(seed, split, draft.plan);
-  draft.materials = MaterialTable(seed);
-  build_walls(draft);
-  build_openings(draft);
-  furnish(draft);
-  balance_lights(draft);
-  return draft;
-}
-
 /// Instances by name, those of one name by their order.
 std::map<std::string, const Instance*> by_label(const Scene& scene) {
   std::map<std::string, int> count;
@@ -206,7 +192,7 @@ TEST_CASE("colours leave shapes as they are") {
 }
 
 TEST_CASE("a thing swapped to another room takes that room's name, and what stands on it follows") {
-  Draft draft = furnished(kSeed, kSplit);
+  Draft draft = make_draft(kSeed, kSplit, {});
   for (const Edit& edit : all_edits()) {
     if (edit.kind != EditKind::kSwap) continue;
     const auto before = by_label(plain());
@@ -235,8 +221,8 @@ TEST_CASE("a thing swapped to another room takes that room's name, and what stan
 }
 
 TEST_CASE("a lamp switched off gives no light, and other lights stay as bright") {
-  const Draft before = furnished(kSeed, kSplit);
-  Draft after = furnished(kSeed, kSplit);
+  const Draft before = make_draft(kSeed, kSplit, {});
+  Draft after = make_draft(kSeed, kSplit, {});
   apply_edits(after, parse_edits({"state:floor_lamp_1=off"}));
   const auto lamp = static_cast<std::size_t>(std::find_if(before.objects.begin(), before.objects.end(),
                                                           [](const auto& o) { return o.name == "floor lamp 1"; }) -
@@ -253,7 +239,7 @@ TEST_CASE("a lamp switched off gives no light, and other lights stay as bright")
 }
 
 TEST_CASE("a lamp switched on shines, at most as brightly as the room's lamps together") {
-  Draft draft = furnished(kSeed, kSplit);
+  Draft draft = make_draft(kSeed, kSplit, {});
   const std::size_t lights = draft.lights.size();
   apply_edits(draft, parse_edits({"state:pendant_lamp_3=on"}));
   REQUIRE(draft.lights.size() == lights + 1);
@@ -265,8 +251,8 @@ TEST_CASE("a lamp switched on shines, at most as brightly as the room's lamps to
 }
 
 TEST_CASE("removed things take their light with them, and indices of the others stay right") {
-  const Draft before = furnished(kSeed, kSplit);
-  Draft after = furnished(kSeed, kSplit);
+  const Draft before = make_draft(kSeed, kSplit, {});
+  Draft after = make_draft(kSeed, kSplit, {});
   apply_edits(after, parse_edits({"remove:floor_lamp_1"}));
   CHECK(after.objects.size() + 1 == before.objects.size());
   CHECK(after.lights.size() + 1 == before.lights.size());
@@ -284,8 +270,8 @@ TEST_CASE("removed things take their light with them, and indices of the others 
 }
 
 TEST_CASE("a closed curtain lets some of the window's light through") {
-  const Draft before = furnished(kSeed, kSplit);
-  Draft after = furnished(kSeed, kSplit);
+  const Draft before = make_draft(kSeed, kSplit, {});
+  Draft after = make_draft(kSeed, kSplit, {});
   apply_edits(after, parse_edits({"state:curtain_1=closed"}));
   REQUIRE(after.lights.size() == before.lights.size());
   int dimmed = 0;
@@ -349,7 +335,7 @@ TEST_CASE("open doors keep clear of other things") {
   for (std::uint64_t seed = 0; seed < 8; ++seed) {
     for (const Edit& edit : possible_edits(seed, Split::kVal, {})) {
       if (edit.kind != EditKind::kState || edit.value != "open") continue;
-      Draft draft = furnished(seed, Split::kVal);
+      Draft draft = make_draft(seed, Split::kVal, {});
       apply_edits(draft, {edit});
       const auto owner = std::find_if(draft.objects.begin(), draft.objects.end(),
                                       [&](const Object& object) { return object.name == edit.name; });

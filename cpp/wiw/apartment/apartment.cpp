@@ -25,7 +25,7 @@ Split split_from_name(const std::string& name) {
 
 std::string split_name(Split split) { return kSplitNames[static_cast<std::size_t>(split)]; }
 
-namespace {
+namespace {}  // namespace
 
 Draft make_draft(std::uint64_t seed, Split split, const std::vector<Edit>& edits) {
   Draft draft;
@@ -41,8 +41,6 @@ Draft make_draft(std::uint64_t seed, Split split, const std::vector<Edit>& edits
   apply_edits(draft, edits);
   return draft;
 }
-
-}  // namespace
 
 scene::Scene make_apartment(std::uint64_t seed, Split split, ThreadPool& pool) {
   return make_apartment(seed, split, {}, pool);

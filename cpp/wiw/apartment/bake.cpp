@@ -22,7 +22,7 @@ std::uint8_t to_byte(float value) {
   return static_cast<std::uint8_t>(std::lround(255.f * std::min(1.f, std::max(0.f, value))));
 }
 
-/// Mean of the kPhases shifts of the sampling patterns that tile a chart: a 4 x 4 box, shrunk at the chart's edges.
+/// Mean of the kPhases parts of the sampling pattern, which tile a chart: a 4 x 4 box, shrunk at the chart's edges.
 std::vector<Rgb> smoothed(const std::vector<Rgb>& light, const ChartPlace& place) {
   const auto at = [&](const std::vector<Rgb>& from, int row, int column) -> const Rgb& {
     return from[static_cast<std::size_t>(row * place.columns + column)];
@@ -185,13 +185,13 @@ void describe(scene::Scene& scene, const Draft& draft) {
 
 }  // namespace
 
-scene::Scene bake(const Draft& draft, ThreadPool& pool) {
+scene::Scene bake(const Draft& draft, ThreadPool& pool, const BounceRays& rays) {
   scene::Scene scene;
   describe(scene, draft);
   scene.textures = draft.materials.draw_textures(pool);
   scene.materials = draft.materials.to_materials();
   const Atlas atlas(draft.charts);
-  const LightSolver solver(draft, atlas, scene.textures);
+  const LightSolver solver(draft, atlas, scene.textures, rays);
   const std::vector<Rgb> light = solver.solve(pool);
   scene.textures.push_back(make_lightmap(atlas, light, pool));
   scene.textures.push_back({"full light", {4, 4}, std::vector<std::uint8_t>(64, 255)});

@@ -14,6 +14,8 @@
 
 namespace wiw::apartment {
 
+struct Edit;
+
 /// Flat rectangle whose light is kept in texels: walls, floors, ceilings.
 struct Chart {
   Vec3 origin, u, v;  // corner and unit axes; the lit side is u x v
@@ -102,8 +104,14 @@ BuiltPiece build_piece(const Design& design, const std::string& state, MaterialT
 Rgb lamp_color();
 /// Gives each room its share of light for its size.
 void balance_lights(Draft& draft);
+/// Plans, furnishes and lights an apartment, then edits it.
+Draft make_draft(std::uint64_t seed, Split split, const std::vector<Edit>& edits);
+/// How many packets of 16 rays look for bounced light. A texel's are few, since a 4 x 4 block of texels is smoothed.
+struct BounceRays {
+  std::size_t texel_packets = 1, vertex_packets = 2;
+};
 /// The finished scene with baked light.
-scene::Scene bake(const Draft& draft, ThreadPool& pool);
+scene::Scene bake(const Draft& draft, ThreadPool& pool, const BounceRays& rays = {});
 /// The same instances without light and textures.
 scene::Scene outline(const Draft& draft);
 

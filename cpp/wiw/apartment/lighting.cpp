@@ -12,11 +12,10 @@ namespace wiw::apartment {
 namespace {
 
 constexpr float kTurn = 6.2831853f;
-constexpr float kLift = 0.004f;            // of samples above their surface
-constexpr std::size_t kBouncePackets = 4;  // of 16 rays a sample
-constexpr float kLampRadius = 0.14f;       // of the ball that stands for a lamp, for soft shadows
-constexpr float kSoftening = 0.12f;        // square metres added to squared distances: no hot spots beside lamps
-constexpr std::size_t kBlock = 256;        // samples a job
+constexpr float kLift = 0.004f;       // of samples above their surface
+constexpr float kLampRadius = 0.14f;  // of the ball that stands for a lamp, for soft shadows
+constexpr float kSoftening = 0.12f;   // square metres added to squared distances: no hot spots beside lamps
+constexpr std::size_t kBlock = 256;   // samples a job
 
 /// Additive recurrence of the plastic number: the most even simple sequence of points in the unit square
 /// (M. Roberts, "The unreasonable effectiveness of quasirandom sequences", 2018).
@@ -25,42 +24,46 @@ Vec2 even_point(std::uint32_t i) {
   return {static_cast<float>(x - std::floor(x)), static_cast<float>(y - std::floor(y))};
 }
 
-Vec2 shifted(const Vec2& point, std::uint32_t phase) {
-  const Vec2 p = point + even_point(1000u + phase);
-  return {p.x() - std::floor(p.x()), p.y() - std::floor(p.y())};
+/// Phases have `count` successive points each. Thus all sixteen together, whose light smoothing mixes in every texel,
+/// are as even as those of one.
+Vec2 point_of_phase(std::uint32_t phase, std::size_t i, std::size_t count) {
+  return even_point(static_cast<std::uint32_t>(count * phase + i));
 }
 
-/// The sampling patterns of one phase. They are the same for all samples, so sines and cosines are computed once.
-struct SamplePoints {
-  std::array<Vec2, RayTracer::kWidth> square;      // even points in the unit square
-  std::array<Vec3, RayTracer::kWidth> ball;        // on the unit ball
-  std::array<Vec3x16, kBouncePackets> hemisphere;  // unit directions around Z, as many as the cosine says
+/// Sets a direction around Z. Even points of the unit square become directions as many as the cosine says.
+void set_direction(std::vector<Vec3x16>& packets, std::size_t i, const Vec2& square) {
+  Vec3x16& packet = packets[i / RayTracer::kWidth];
+  const std::size_t lane = i % RayTracer::kWidth;
+  const float r = std::sqrt(square.x());
+  packet.x[lane] = r * std::cos(kTurn * square.y());
+  packet.y[lane] = r * std::sin(kTurn * square.y());
+  packet.z[lane] = std::sqrt(1.f - square.x());
+}
 
-  explicit SamplePoints(std::uint32_t phase) {
-    for (std::uint32_t i = 0; i < RayTracer::kWidth; ++i) {
-      const Vec2 p = square[i] = shifted(even_point(i), phase);
-      const float z = 2.f * p.x() - 1.f, r = std::sqrt(1.f - z * z);
-      ball[i] = Vec3(r * std::cos(kTurn * p.y()), z, r * std::sin(kTurn * p.y()));
-    }
-    for (std::uint32_t i = 0; i < kBouncePackets * RayTracer::kWidth; ++i) {
-      const Vec2 p = shifted(even_point(i), phase);
-      const float r = std::sqrt(p.x());
-      Vec3x16& packet = hemisphere[i / RayTracer::kWidth];
-      const std::size_t lane = i % RayTracer::kWidth;
-      packet.x[lane] = r * std::cos(kTurn * p.y());
-      packet.y[lane] = r * std::sin(kTurn * p.y());
-      packet.z[lane] = std::sqrt(1.f - p.x());
-    }
+std::vector<Vec3x16> directions_of_phase(std::uint32_t phase, std::size_t packets) {
+  std::vector<Vec3x16> made(packets);
+  const std::size_t count = packets * RayTracer::kWidth;
+  for (std::size_t i = 0; i < count; ++i) set_direction(made, i, point_of_phase(phase, i, count));
+  return made;
+}
+
+/// Directions for samples that nothing smooths: a spiral by the golden angle, the evenest for a fixed number
+/// (H. Vogel, "A better way to construct the sunflower head", 1979).
+std::vector<Vec3x16> spiral_directions(std::size_t packets) {
+  std::vector<Vec3x16> made(packets);
+  const std::size_t count = packets * RayTracer::kWidth;
+  for (std::size_t i = 0; i < count; ++i) {
+    const double turn = 0.6180339887498949 * static_cast<double>(i);
+    const float ring = (static_cast<float>(i) + 0.5f) / static_cast<float>(count);
+    set_direction(made, i, Vec2(ring, static_cast<float>(turn - std::floor(turn))));
   }
-};
+  return made;
+}
 
-const SamplePoints& points_of(std::uint32_t phase) {
-  static const std::vector<SamplePoints> phases = [] {
-    std::vector<SamplePoints> made;
-    for (std::uint32_t each = 0; each < kPhases; ++each) made.emplace_back(each);
-    return made;
-  }();
-  return phases[phase];
+/// Maps the unit square to the unit ball's surface, areas in proportion.
+Vec3 on_ball(const Vec2& square) {
+  const float z = 2.f * square.x() - 1.f, r = std::sqrt(1.f - z * z);
+  return {r * std::cos(kTurn * square.y()), z, r * std::sin(kTurn * square.y())};
 }
 
 struct Frame {
@@ -89,8 +92,11 @@ float surface_area(const FloorPlan& plan, std::int32_t room) {
 
 }  // namespace
 
-LightSolver::LightSolver(const Draft& draft, const Atlas& atlas, const std::vector<scene::Texture>& textures)
-    : atlas_(atlas), charts_(draft.charts) {
+LightSolver::LightSolver(const Draft& draft, const Atlas& atlas, const std::vector<scene::Texture>& textures,
+                         const BounceRays& rays)
+    : atlas_(atlas), charts_(draft.charts), vertex_rays_(spiral_directions(rays.vertex_packets)) {
+  for (std::uint32_t phase = 0; phase < kPhases; ++phase)
+    texel_rays_[phase] = directions_of_phase(phase, rays.texel_packets);
   std::vector<Rgb> albedo;
   for (MaterialId id = 0; id < draft.materials.size(); ++id) {
     const Finish& finish = draft.materials.finish(id);
@@ -202,13 +208,12 @@ void LightSolver::place_targets() {
   for (std::size_t number = 0; number < lights_.size(); ++number) {
     const Light& light = lights_[number];
     for (std::uint32_t phase = 0; phase < kPhases; ++phase) {
-      const SamplePoints& points = points_of(phase);
       Vec3x16& targets = targets_[number][phase];
       for (std::size_t i = 0; i < RayTracer::kWidth; ++i) {
-        const Vec2& p = points.square[i];
+        const Vec2 p = point_of_phase(phase, i, RayTracer::kWidth);
         const Vec3 target = light.one_sided()
                                 ? Vec3(light.center + (2.f * p.x() - 1.f) * light.u + (2.f * p.y() - 1.f) * light.v)
-                                : Vec3(light.center + kLampRadius * points.ball[i]);
+                                : Vec3(light.center + kLampRadius * on_ball(p));
         targets.x[i] = target.x(), targets.y[i] = target.y(), targets.z[i] = target.z();
       }
     }
@@ -269,13 +274,11 @@ Rgb LightSolver::direct(const Sample& sample) const {
   return sum;
 }
 
-Rgb LightSolver::bounced(const Sample& sample, const std::vector<Rgb>& direct_light,
-                         const std::vector<Rgb>& ambient) const {
+Rgb LightSolver::bounced(const Sample& sample, const std::vector<Vec3x16>& hemisphere,
+                         const std::vector<Rgb>& direct_light, const std::vector<Rgb>& ambient) const {
   const Frame frame = frame_around(sample.normal);
-  const SamplePoints& points = points_of(sample.phase);
   Rgb sum = Rgb::Zero();
-  for (std::size_t packet = 0; packet < kBouncePackets; ++packet) {
-    const Vec3x16& local = points.hemisphere[packet];
+  for (const Vec3x16& local : hemisphere) {
     Vec3x16 directions;
     for (std::size_t i = 0; i < RayTracer::kWidth; ++i) {
       directions.x[i] = local.x[i] * frame.x.x() + local.y[i] * frame.y.x() + local.z[i] * frame.z.x();
@@ -300,7 +303,7 @@ Rgb LightSolver::bounced(const Sample& sample, const std::vector<Rgb>& direct_li
       sum += face.albedo.cwiseProduct(light);
     }
   }
-  return sum / (kBouncePackets * RayTracer::kWidth);
+  return sum / static_cast<float>(hemisphere.size() * RayTracer::kWidth);
 }
 
 /// Light of the second and later bounces: a geometric series with the mean light and a middling albedo.
@@ -328,7 +331,10 @@ std::vector<Rgb> LightSolver::solve(ThreadPool& pool) const {
   };
   for_all([&](std::size_t i) { first[i] = direct(samples_[i]); });
   const std::vector<Rgb> later = ambient(first, lit_.size());
-  for_all([&](std::size_t i) { total[i] = first[i] + bounced(samples_[i], first, later); });
+  for_all([&](std::size_t i) {
+    const std::vector<Vec3x16>& hemisphere = i < atlas_.texels ? texel_rays_[samples_[i].phase] : vertex_rays_;
+    total[i] = first[i] + bounced(samples_[i], hemisphere, first, later);
+  });
   return total;
 }
 

@@ -12,7 +12,7 @@ namespace wiw::apartment {
 struct Sample {
   Vec3 position, normal;
   std::int32_t room = kOutside;
-  std::uint32_t phase = 0;  // selects one of kPhases shifts of the sampling patterns
+  std::uint32_t phase = 0;  // selects one of kPhases parts of the sampling pattern
 };
 constexpr std::uint32_t kPhases = 16;
 
@@ -20,7 +20,8 @@ constexpr std::uint32_t kPhases = 16;
 /// per room for the bounces after it. Light is in units in which a surface shows its albedo times the light, linear.
 class LightSolver {
  public:
-  LightSolver(const Draft& draft, const Atlas& atlas, const std::vector<scene::Texture>& textures);
+  LightSolver(const Draft& draft, const Atlas& atlas, const std::vector<scene::Texture>& textures,
+              const BounceRays& rays = {});
 
   /// Charts' texels in the atlas's order, then the vertices of all objects' parts in order.
   [[nodiscard]] const std::vector<Sample>& samples() const { return samples_; }
@@ -44,15 +45,18 @@ class LightSolver {
   void find_reach(const Draft& draft);
   [[nodiscard]] Rgb direct(const Sample& sample) const;
   [[nodiscard]] Rgb from_light(const Sample& sample, const VisibleLight& lit) const;
-  [[nodiscard]] Rgb bounced(const Sample& sample, const std::vector<Rgb>& direct_light,
-                            const std::vector<Rgb>& ambient) const;
+  /// Light after one bounce, seen along directions around the sample's normal.
+  [[nodiscard]] Rgb bounced(const Sample& sample, const std::vector<Vec3x16>& hemisphere,
+                            const std::vector<Rgb>& direct_light, const std::vector<Rgb>& ambient) const;
   [[nodiscard]] std::vector<Rgb> ambient(const std::vector<Rgb>& direct_light, std::size_t rooms) const;
 
   const Atlas& atlas_;
   const std::vector<Chart>& charts_;
   std::vector<Light> lights_;
-  std::vector<std::array<Vec3x16, kPhases>> targets_;  // points on each light
-  std::vector<std::vector<VisibleLight>> lit_;         // by room
+  std::vector<std::array<Vec3x16, kPhases>> targets_;     // points on each light
+  std::vector<std::vector<VisibleLight>> lit_;            // by room
+  std::array<std::vector<Vec3x16>, kPhases> texel_rays_;  // around Z, of the bounce
+  std::vector<Vec3x16> vertex_rays_;
   std::vector<Sample> samples_;
   std::vector<Face> faces_;
   std::vector<std::int32_t> face_room_;

@@ -169,6 +169,11 @@ def test_places_are_counted_once_and_the_start_not_at_all() -> None:
     owners, places = find_places(path)
     assert owners.tolist() == [-1, 0, 0, 0, 1]
     np.testing.assert_allclose(places, path[[1, 4]])
+    round_turn = [TURN_LEFT] * 8
+    back = to_trajectory([FORWARD, FORWARD, *round_turn, FORWARD, FORWARD, *round_turn, FORWARD])[:, :2]
+    owners, places = find_places(back)
+    assert owners.tolist() == [0, 1, *[1] * 8, 0, -1, *[-1] * 8, 0]
+    np.testing.assert_allclose(places, back[:2])
     assert find_places(np.zeros((2, 2)))[1].shape == (0, 2)
 
 

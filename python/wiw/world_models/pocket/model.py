@@ -134,12 +134,13 @@ def find_places(positions: NDArray[np.float64]) -> tuple[NDArray[np.int64], NDAr
         positions: [K, 2], metres from where the path starts.
 
     Returns:
-        int64 [K], -1 where the agent still stands where it started, and float64 [F, 2].
+        int64 [K], -1 where the agent stands where it started, and float64 [F, 2].
     """
-    owners, places, last = [], [], np.zeros(2)
+    places, owners = [np.zeros(2)], []
     for position in positions:
-        if np.abs(position - last).max() > STILL:
-            last = position
+        here = [np.abs(position - place).max() <= STILL for place in places]
+        if not any(here):
             places.append(position)
-        owners.append(len(places) - 1)
-    return np.array(owners, np.int64), np.array(places, np.float64).reshape(-1, 2)
+            here.append(True)
+        owners.append(here.index(True) - 1)
+    return np.array(owners, np.int64), np.array(places[1:], np.float64).reshape(-1, 2)
