@@ -12,13 +12,14 @@ begins with the files of `tests/data/fuzz/READER`, each of which reaches other c
 
 from __future__ import annotations
 
+import os
 import random
 import resource
 import shlex
 import signal
 import sys
+import tempfile
 from pathlib import Path
-from tempfile import TemporaryDirectory
 from types import FunctionType
 
 import atheris
@@ -87,5 +88,7 @@ def fuzz(name: str, folder: Path, options: list[str]) -> None:
 if __name__ == "__main__":
     if len(sys.argv) < 2 or sys.argv[1] not in READERS:
         sys.exit(f"usage: fuzz_readers.py READER [OPTION ...]; readers: {', '.join(READERS)}")
-    with TemporaryDirectory() as own:
+    if os.access("/dev/shm", os.W_OK):  # files there are written up to ten times as fast
+        tempfile.tempdir = "/dev/shm"
+    with tempfile.TemporaryDirectory() as own:
         fuzz(sys.argv[1], Path(own), sys.argv[2:])

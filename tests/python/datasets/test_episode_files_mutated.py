@@ -7,6 +7,7 @@ import gzip
 import json
 import random
 from collections.abc import Callable
+from functools import cache
 from pathlib import Path
 from typing import Any
 
@@ -86,12 +87,16 @@ def change_value(value: Any, draw: random.Random) -> Any:
         else:
             copy[name] = change_value(copy[name], draw)
         return copy
-    if draw.random() < 0.1:
-        deep: Any = 1
-        for _ in range(draw.choice((40, 900, 100_000))):
-            deep = [deep]
-        return deep
-    return draw.choice(ODD)
+    return nest(draw.choice((40, 900, 100_000))) if draw.random() < 0.1 else draw.choice(ODD)
+
+
+@cache
+def nest(levels: int) -> Any:
+    """So many lists in one another, made once: it takes milliseconds."""
+    deep: Any = 1
+    for _ in range(levels):
+        deep = [deep]
+    return deep
 
 
 def as_json(value: Any) -> bytes:
