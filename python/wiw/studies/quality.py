@@ -193,6 +193,20 @@ def quality(
     return Quality(table, folder, _choose_pictures(chosen, keys))
 
 
+def require_scorers(scorers: Sequence[str], lpips: str | Path | None) -> None:
+    """Check that scorers start and that weights are there, before anything takes time.
+
+    Raises:
+        ScorerError: a command cannot be run, or gives no card.
+        WeightsError: weights are missing.
+    """
+    if lpips is not None:
+        Lpips(lpips)
+    for scorer in scorers:
+        with make_scorer(scorer):
+            pass
+
+
 def _require_same_budget(chosen: Sequence[_Arm]) -> None:
     """Check that all arms execute as many actions per decision, on which success depends.
 

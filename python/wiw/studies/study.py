@@ -22,7 +22,7 @@ from wiw.files import atomic_file
 from wiw.report.tables import SummaryTable, print_summary
 from wiw.runs.rows import to_json
 from wiw.studies.evaluate import run_arms
-from wiw.studies.quality import quality
+from wiw.studies.quality import quality, require_scorers
 from wiw.studies.run_log import RunLog
 from wiw.studies.study_file import StudyPlan, StudyRun, load_study
 
@@ -142,7 +142,7 @@ def _require(run: StudyRun) -> None:
     """Check that a run can start, before spending time on any.
 
     Raises:
-        Error: its task or its agents cannot be.
+        Error: its task, its agents or the scorers of its frames cannot be.
     """
     task = run.task.build()
     count = task.default_episodes if run.settings.episodes is None else run.settings.episodes
@@ -153,6 +153,8 @@ def _require(run: StudyRun) -> None:
             raise ArgumentError(
                 f"study: {run.name}: arm '{arm}' is not a name; quality can only be measured on stored runs"
             )
+    if run.quality is not None:
+        require_scorers(run.quality.get("scorers", ()), run.quality.get("lpips"))
 
 
 def _run(run: StudyRun, folder: Path, workers: int, progress: bool) -> StudyPart:

@@ -150,6 +150,8 @@ def load_study(study: str | Path, variables: Mapping[str, Any] | None = None, sm
     filled = {name: _substitute(content.get(name), values, f"{path}: {name}") for name in _KEYS[:3] + _KEYS[5:]}
     runs = _require_mapping(filled["runs"], f"{path}: runs")
     shared = _require_mapping(filled["settings"] or {}, f"{path}: settings")
+    for name in runs:
+        _require_text(name, f"{path}: runs")
     made = tuple(_read_run(str(name), each, shared, f"{path}: runs: {name}") for name, each in runs.items())
     if not made:
         raise ArgumentError(f"{path}: runs: expected at least one run by name, got none")
@@ -193,9 +195,7 @@ def _read_run(name: str, content: Any, shared: Mapping[str, Any], where: str) ->
     pairs = tuple(pair for pair in pairs if all(arm in agents for arm in pair) or _refuse_pair(pair, named, where))
     plots = _require_names(content.get("plots", ["success"]), f"{where}: plots")
     require_known(plots, PLOTS, f"{where}: plots")
-    quality = _require_mapping(content.get("quality") or {}, f"{where}: quality") if "quality" in plots else None
-    if quality is not None:
-        quality = read_values(_QualityOptions, quality, f"{where}: quality")
+    quality = _read_quality(content.get("quality") or {}, plots, f"{where}: quality")
     settings = {**shared, **_require_mapping(content.get("settings") or {}, f"{where}: settings")}
     known = [field.name for field in fields(RunConfig) if field.name not in _OWN_SETTINGS]
     require_known(settings, known, f"{where}: settings")
@@ -203,6 +203,14 @@ def _read_run(name: str, content: Any, shared: Mapping[str, Any], where: str) ->
     options = _require_mapping(content.get("task_options") or {}, f"{where}: task_options")
     task = TaskRecipe(str(content.get("task", "imagenav")), dict(options))
     return StudyRun(name, _give_seed(task, settings), agents, RunConfig(**settings), pairs, plots, quality)
+
+
+def _read_quality(options: Any, plots: Sequence[str], where: str) -> Mapping[str, Any] | None:
+    """Return the options of `wiw.quality`, or None where no plot asks for it."""
+    values = read_values(_QualityOptions, _require_mapping(options, where), where)
+    if values and "quality" not in plots:
+        raise ArgumentError(f"{where}: nothing is scored without its plot; add `quality` to plots, or omit the options")
+    return values if "quality" in plots else None
 
 
 def _give_seed(task: TaskRecipe, settings: Mapping[str, Any]) -> TaskRecipe:
@@ -218,6 +226,7 @@ def _read_arms(arms: Any, agent: Any, where: str) -> dict[str, AgentRecipe]:
     found = {}
     for name, own in _require_mapping(arms, f"{where}: arms").items():
         place = f"{where}: arms: {name}"
+        _require_text(name, place)
         check_arm_name(str(name), place)
         changes = dict(_require_mapping(own or {}, place))
         if changes.pop("when", True):
@@ -261,6 +270,12 @@ def _require_pairs(value: Any, where: str) -> Sequence[Sequence[Any]]:
     if not isinstance(value, list) or not all(isinstance(pair, list) and len(pair) == 2 for pair in value):
         raise ArgumentError(f"{where}: compare: expected pairs of arms, such as [[front, none]], got {value!r}")
     return value
+
+
+def _require_text(name: Any, where: str) -> None:
+    """Refuse a name that YAML reads as something else, such as `no`, `off` or `null`."""
+    if name is None or isinstance(name, bool):
+        raise ArgumentError(f"{where}: expected a name, got one that YAML reads as {name}; put it in quotes")
 
 
 def _require_names(value: Any, where: str) -> tuple[str, ...]:

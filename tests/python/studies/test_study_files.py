@@ -16,7 +16,7 @@ from fakes import LineAgent, LineTask
 
 import wiw
 from wiw.cli.app import main
-from wiw.errors import ArgumentError, FileError, StoreError
+from wiw.errors import ArgumentError, FileError, ScorerError, StoreError, WeightsError
 from wiw.report import study_page
 from wiw.runs.config import RunConfig
 from wiw.studies.evaluate import run_arms
@@ -166,6 +166,17 @@ def test_a_pair_of_arms_named_by_text_says_which_is_unknown(tmp_path: Path) -> N
             "quality: frames: expected a whole number, got 'many'",
         ),
         ("[success, rollouts]", "[quality]\n    quality: {frame: 8}", "quality: unknown name 'frame'.*mean frames"),
+        (
+            "[success, rollouts]",
+            "[success]\n    quality: {frames: 8}",
+            "here: quality: nothing is scored without its plot; add `quality` to plots",
+        ),
+        (
+            "      front:",
+            "      no:",
+            "arms: False: expected a name, got one that YAML reads as False; put it in quotes",
+        ),
+        ("  here:", "  null:", "runs: expected a name, got one that YAML reads as None"),
         ("keep_images: 0", "keep_image: 0", "settings: unknown name 'keep_image'.*Did you mean keep_images"),
         ("seed: 3", "out: there", "settings: unknown name 'out'"),
         ("seed: 3", "seed: three", "settings: seed: expected a whole number or null, got 'three'"),
@@ -184,6 +195,18 @@ def test_what_a_study_cannot_say_is_refused_with_its_place(own: Path, old: str, 
     own.write_text(text.replace(old, new, 1))
     with pytest.raises(ArgumentError, match=said):
         load_study(own)
+
+
+def test_scorers_and_weights_are_looked_for_before_anything_runs(own: Path, tmp_path: Path) -> None:
+    text = own.read_text()
+    for options, error, said in (
+        ("scorers: [no-such-command]", ScorerError, "no-such-command"),
+        (f"lpips: {tmp_path}", WeightsError, "lpips"),
+    ):
+        own.write_text(text.replace("[success, rollouts]", f"[quality]\n    quality: {{{options}}}", 1))
+        with pytest.raises(error, match=said):
+            wiw.study(own, out=tmp_path / "out", progress=False)
+    assert not (tmp_path / "out").exists()
 
 
 def test_studies_are_listed_taught_and_looked_up(capsys: Any, tmp_path: Path) -> None:
