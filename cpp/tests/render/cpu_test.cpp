@@ -340,7 +340,32 @@ std::size_t mapped_bytes() {
   return pages * static_cast<std::size_t>(sysconf(_SC_PAGESIZE));
 }
 
+constexpr std::size_t kMegabyte = 1 << 20;
+
+/// Limits the addresses of the process while it lives.
+class MemoryLimit {
+ public:
+  explicit MemoryLimit(std::size_t bytes) {
+    getrlimit(RLIMIT_AS, &free_);
+    const rlimit tight{bytes, free_.rlim_max};
+    setrlimit(RLIMIT_AS, &tight);
+  }
+  ~MemoryLimit() { setrlimit(RLIMIT_AS, &free_); }
+  MemoryLimit(const MemoryLimit&) = delete;
+  MemoryLimit& operator=(const MemoryLimit&) = delete;
+
+ private:
+  rlimit free_{};
+};
+
 }  // namespace
+
+TEST_CASE("small scenes come and go where Embree's caches would have no room") {
+  const scene::ScenePtr scene = make_furnished();
+  const cpu::ShadingScene shading(*scene);
+  const MemoryLimit limit(mapped_bytes() + 60 * kMegabyte);
+  for (int i = 0; i < 20; ++i) CHECK_NOTHROW(cpu::EmbreeScene(*scene, shading, Isa::kScalar));
+}
 
 TEST_CASE("a scene that memory ends for leaves nothing in Embree") {
   SceneBuilder builder;
@@ -353,13 +378,9 @@ TEST_CASE("a scene that memory ends for leaves nothing in Embree") {
     builder.add_instance(mesh);
   }
   const scene::ScenePtr scene = builder.build();
-  constexpr std::size_t kMegabyte = 1 << 20;
   const cpu::ShadingScene shading(*scene);
   const std::size_t before = mapped_bytes();
-  rlimit free{};
-  getrlimit(RLIMIT_AS, &free);
-  const rlimit tight{before + 40 * kMegabyte, free.rlim_max};
-  setrlimit(RLIMIT_AS, &tight);
+  const MemoryLimit limit(before + 40 * kMegabyte);
   int refused = 0;
   for (int i = 0; i < 6; ++i) {
     try {
@@ -368,7 +389,6 @@ TEST_CASE("a scene that memory ends for leaves nothing in Embree") {
       ++refused;
     }
   }
-  setrlimit(RLIMIT_AS, &free);
   CHECK(refused == 6);
   CHECK(mapped_bytes() < before + 24 * kMegabyte);
 }

@@ -10,7 +10,7 @@ namespace wiw::apartment {
 RayTracer::RayTracer(std::vector<Vec3> vertices, std::vector<scene::Triangle> triangles)
     : vertices_(std::move(vertices)), triangles_(std::move(triangles)) {
   // One thread builds one and the same tree every time, so coplanar surfaces are always hit in the same order.
-  device_ = rtcNewDevice("threads=1,set_affinity=0");
+  device_ = rtcNewDevice("threads=1,set_affinity=0,tessellation_cache_size=0");  // as in the renderer
   if (device_ == nullptr)
     throw BackendError("Embree could not create a device (error " + std::to_string(rtcGetDeviceError(nullptr)) + ")");
   wide_ = rtcGetDeviceProperty(device_, RTC_DEVICE_PROPERTY_NATIVE_RAY16_SUPPORTED) != 0;

@@ -10,9 +10,11 @@ namespace {
 
 constexpr unsigned kVisible = 0xFFFFFFFF;  // to every ray
 
-/// Embree's kernels must match ours in width: a packet wider than its native one is traced ray by ray.
+/// Embree's kernels must match ours in width: a packet wider than its native one is traced ray by ray. Its cache of
+/// subdivision surfaces, which no scene has, takes 128 MB of addresses, and where there is no room for them Embree 3
+/// leaves its locks locked: the next device to be released would wait for ever.
 std::string device_options(Isa isa) {
-  std::string options = "threads=" + std::to_string(ThreadPool::shared().size());
+  std::string options = "tessellation_cache_size=0,threads=" + std::to_string(ThreadPool::shared().size());
 #if defined(__x86_64__)
   options += isa == Isa::kAvx512 ? ",isa=avx512" : isa == Isa::kAvx2 ? ",isa=avx2" : ",isa=sse2";
 #endif
