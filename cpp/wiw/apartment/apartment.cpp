@@ -25,8 +25,6 @@ Split split_from_name(const std::string& name) {
 
 std::string split_name(Split split) { return kSplitNames[static_cast<std::size_t>(split)]; }
 
-namespace {}  // namespace
-
 Draft make_draft(std::uint64_t seed, Split split, const std::vector<Edit>& edits) {
   Draft draft;
   draft.seed = seed;

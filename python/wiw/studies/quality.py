@@ -193,7 +193,7 @@ def quality(
     return Quality(table, folder, _choose_pictures(chosen, keys))
 
 
-def require_scorers(scorers: Sequence[str], lpips: str | Path | None) -> None:
+def require_scorers(scorers: Sequence[str] = (), lpips: str | Path | None = None, deadline: float = DEADLINE) -> None:
     """Check that scorers start and that weights are there, before anything takes time.
 
     Raises:
@@ -203,7 +203,7 @@ def require_scorers(scorers: Sequence[str], lpips: str | Path | None) -> None:
     if lpips is not None:
         Lpips(lpips)
     for scorer in scorers:
-        with make_scorer(scorer):
+        with make_scorer(scorer, deadline):
             pass
 
 

@@ -154,7 +154,7 @@ def _require(run: StudyRun) -> None:
                 f"study: {run.name}: arm '{arm}' is not a name; quality can only be measured on stored runs"
             )
     if run.quality is not None:
-        require_scorers(run.quality.get("scorers", ()), run.quality.get("lpips"))
+        require_scorers(**{name: value for name, value in run.quality.items() if name != "frames"})
 
 
 def _run(run: StudyRun, folder: Path, workers: int, progress: bool) -> StudyPart:

@@ -8,6 +8,7 @@ import re
 import subprocess
 import sys
 from pathlib import Path
+from tempfile import TemporaryDirectory
 
 import pytest
 from locations import TESTS
@@ -25,8 +26,10 @@ def fuzz(name: str, folder: Path, *options: str) -> None:
     pytest.importorskip("atheris", reason="needs atheris, which has packages for Linux on x86 alone")
     code = TESTS / "reliability" / "fuzz_readers.py"
     command = [sys.executable, code, name, f"-artifact_prefix={folder}/", *options]
-    environment = {**os.environ, "TMPDIR": str(folder)}
-    done = subprocess.run(command, capture_output=True, text=True, env=environment, check=False)
+    memory = "/dev/shm" if os.access("/dev/shm", os.W_OK) else None  # files there are written up to ten times as fast
+    with TemporaryDirectory(dir=memory) as own:  # libFuzzer's end leaves them
+        environment = {**os.environ, "TMPDIR": own}
+        done = subprocess.run(command, capture_output=True, text=True, env=environment, check=False)
     kept = sorted(folder.glob("*-*"))  # crash-, timeout-, oom-
     assert done.returncode == 0, f"{name}: {kept}: {done.stdout[-3000:]}{done.stderr[-1000:]}"  # error, then progress
     runs = re.search(r"Done (\d+) runs", done.stderr)
