@@ -32,6 +32,7 @@ __all__ = [
     "find_error_class",
     "find_raising_line",
     "is_stop_request",
+    "read_text",
 ]
 
 OWN = str(Path(__file__).parent)
@@ -68,6 +69,14 @@ def find_raising_line(error: BaseException) -> traceback.FrameSummary | None:
     foreign = [frame for frame in frames if not frame.filename.startswith((OWN, "<"))]
     users = [frame for frame in foreign if not frame.filename.startswith(LIBRARIES)]
     return next(reversed(users or foreign), None)
+
+
+def read_text(error: BaseException) -> str:
+    """Return an exception's text in one line; that of somebody else's may fail to be made, which the line then says."""
+    try:
+        return " ".join(str(error).split())
+    except Exception as fault:
+        return f"its text cannot be had ({type(fault).__name__})"
 
 
 def read_last_line(report: str) -> str:

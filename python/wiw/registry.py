@@ -24,7 +24,15 @@ from importlib.metadata import entry_points
 from pathlib import Path
 from typing import Any
 
-from wiw.errors import ArgumentError, ConstructionError, Error, RegistryError, find_raising_line, is_stop_request
+from wiw.errors import (
+    ArgumentError,
+    ConstructionError,
+    Error,
+    RegistryError,
+    find_raising_line,
+    is_stop_request,
+    read_text,
+)
 from wiw.source_files import digest_imports
 from wiw.suggestions import did_you_mean
 
@@ -159,7 +167,7 @@ class Registry:
                 raise
             name = what if isinstance(what, str) else getattr(what, "__qualname__", repr(what))
             raise ConstructionError(
-                f"{self.kind} '{name}' cannot be built: {type(error).__name__}: {error}{_locate_error(error)}"
+                f"{self.kind} '{name}' cannot be built: {type(error).__name__}: {read_text(error)}{_locate_error(error)}"
             ) from error
 
     def _list_plugins(self) -> dict[str, Any]:
@@ -172,7 +180,7 @@ class Registry:
             if is_stop_request(error):
                 raise
             raise RegistryError(
-                f"{self.kind} '{name}' cannot be loaded: {type(error).__name__}: {error}{_locate_error(error)}"
+                f"{self.kind} '{name}' cannot be loaded: {type(error).__name__}: {read_text(error)}{_locate_error(error)}"
             ) from error
         return self._check_kind(name, found) if inspect.isclass(found) else found
 

@@ -75,6 +75,15 @@ def raise_exception(*_):
     raise ValueError("no \x1b[31mcolour")
 
 
+class SpeechlessError(Exception):
+    def __str__(self):
+        raise KeyError("words")
+
+
+def raise_without_words(*_):
+    raise SpeechlessError
+
+
 def raise_base_exception(*_):
     raise Leaving("enough")
 
@@ -238,6 +247,7 @@ FATAL = (
 FAILING = (
     call_sys_exit,
     raise_exception,
+    raise_without_words,
     raise_base_exception,
     raise_keyboard_interrupt,
     recurse,

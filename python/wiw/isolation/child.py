@@ -113,10 +113,9 @@ def _call(host: Host, body: bytes, arrays: list[NDArray[np.uint8]]) -> dict[str,
 
 def describe_exception(error: BaseException) -> str:
     """Return the type, the text and the place of an exception, e.g. "ValueError: no (model.py, line 3)"."""
-    text = " ".join(str(error).split())
     place = errors.find_raising_line(error)
     where = "" if place is None else f" ({Path(place.filename).name}, line {place.lineno})"
-    return f"{type(error).__name__}: {text}{where}"
+    return f"{type(error).__name__}: {errors.read_text(error)}{where}"
 
 
 if __name__ == "__main__":

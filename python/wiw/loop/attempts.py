@@ -32,7 +32,7 @@ from typing import Any, cast
 import numpy as np
 from numpy.typing import NDArray
 
-from wiw.errors import ArgumentError, ConstructionError, ContractError, RolloutError, is_stop_request
+from wiw.errors import ArgumentError, ConstructionError, ContractError, RolloutError, is_stop_request, read_text
 from wiw.isolation.failures import EndedError, ExitError, LateError, RaisedError
 from wiw.isolation.models import IsolatedModel, construction_deadline
 from wiw.loop.limits import DEADLINE
@@ -242,7 +242,7 @@ def _serve(items: queue.SimpleQueue[_WorkItem | None]) -> None:
 
 
 def _describe_error(error: Exception) -> str:
-    text = " ".join(str(error).split())
+    text = read_text(error)
     told = ContractError | LateError | ExitError | EndedError | RaisedError
     return text if isinstance(error, told) else f"{type(error).__name__}: {text}"
 

@@ -10,7 +10,7 @@ from collections.abc import Callable, Sequence
 import numpy as np
 from numpy.typing import NDArray
 
-from wiw.errors import ContractError
+from wiw.errors import ContractError, read_text
 from wiw.json_text import escape_surrogates
 from wiw.serving.queue import Job, Queue
 from wiw.wire.messages import Refusal
@@ -69,11 +69,7 @@ class Worker(threading.Thread):
 
 
 def _refuse(error: BaseException) -> Refusal:
-    try:
-        said = str(error)
-    except Exception as fault:  # the thread has to go on
-        said = f"its text cannot be had ({type(fault).__name__})"
-    kind, text = "raised", f"{type(error).__name__}: {' '.join(said.split())}"
+    kind, text = "raised", f"{type(error).__name__}: {read_text(error)}"
     if isinstance(error, ContractError):
-        kind, text = error.kind, said
+        kind, text = error.kind, str(error)
     return Refusal(b"", kind, escape_surrogates(text))  # a file's name need not be UTF-8

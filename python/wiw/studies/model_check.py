@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 
 from wiw import action
 from wiw.action import FORWARD, TURN_LEFT, TURN_RIGHT
-from wiw.errors import ArgumentError, ConstructionError, ContractError, find_raising_line
+from wiw.errors import ArgumentError, ConstructionError, ContractError, find_raising_line, read_text
 from wiw.isolation.failures import EndedError, ExitError, LateError, RaisedError
 from wiw.loop.attempts import DEADLINE, make_model
 from wiw.loop.history import Frame, stack_histories
@@ -536,4 +536,4 @@ def _locate(error: BaseException) -> str:
     """Return the exception and its place: the last line outside libraries, which is the model's own."""
     place = find_raising_line(error)
     where = "" if place is None else f" ({Path(place.filename).name}, line {place.lineno}: {place.line})"
-    return f"{type(error).__name__}: {error}{where}"
+    return f"{type(error).__name__}: {read_text(error)}{where}"

@@ -49,6 +49,11 @@ class Scripted(wiw.WorldModel):
         return answer
 
 
+class SpeechlessError(Exception):
+    def __str__(self):
+        raise KeyError("words")
+
+
 def ask(model, deadline=5.0):
     return Attempted(model, deadline).rollout(OBSERVATIONS, CONTROLS, SEEDS)
 
@@ -88,6 +93,12 @@ def test_what_fails_every_time_is_named_by_its_kind(answer, kind: str, calls: in
         ask(model)
     assert (caught.value.kind, model.calls) == (kind, calls)
     assert pickle.loads(pickle.dumps(caught.value)).kind == kind
+
+
+def test_an_error_without_words_is_an_error_of_the_model() -> None:
+    with pytest.raises(RolloutError, match=r"SpeechlessError: its text cannot be had \(KeyError\)") as caught:
+        ask(Scripted(SpeechlessError()))
+    assert caught.value.kind == "raised"
 
 
 def test_different_breaches_have_all_their_tries() -> None:

@@ -301,7 +301,7 @@ def test_a_broken_contract_is_named_as_at_home(answer, kind, monkeypatch):
         assert caught.value.kind == kind
         assert (".astype(numpy.uint8)" in str(caught.value)) == (kind == "dtype")
         with pytest.raises(RolloutError) as caught:
-            Attempted(client, 20.0).rollout(make_conditioning(4), plans(4), np.arange(4, dtype=np.uint64))
+            Attempted(client, 60.0).rollout(make_conditioning(4), plans(4), np.arange(4, dtype=np.uint64))
         assert caught.value.kind == kind
 
 
