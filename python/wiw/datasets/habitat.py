@@ -13,7 +13,7 @@ from typing import Any, Literal
 import numpy as np
 
 from wiw._core import core
-from wiw.datasets.fields import length, name_of, number, point, positive, text
+from wiw.datasets.fields import integer, length, name_of, number, point, positive, text
 from wiw.errors import FileError
 from wiw.types import Episode
 
@@ -136,7 +136,7 @@ def _world_in_world(item: Mapping[str, Any], where: str, folder: Path) -> Episod
             info={
                 "source": PUBLISHED,
                 "radius": positive(item["goal_radius"], "goal_radius"),
-                **({} if steps is None else {"ideal_primitives": int(steps)}),
+                **({} if steps is None else {"ideal_primitives": integer(steps, "step_to_goal")}),
                 **({} if picture is None else {"goal_image": picture}),
             },
         )
@@ -176,9 +176,9 @@ def _active_recognition(item: Mapping[str, Any], where: str) -> Episode:
             geodesic=float("nan"),
             info={
                 "source": PUBLISHED,
-                "target": int(item["target_id"]),
+                "target": integer(item["target_id"], "target_id"),
                 "category": text(item["target_categrory"], "target_categrory"),
-                "difficulty": int(item["difficulty"]),
+                "difficulty": integer(item["difficulty"], "difficulty"),
             },
         )
     except _UNREADABLE as error:

@@ -270,6 +270,10 @@ def test_the_published_files_schema_is_read(tmp_path: Path, two_rooms: str) -> N
     np.testing.assert_allclose(episode.goal_position, centre, atol=1e-5)
     assert task.choices == ar.PUBLISHED_CATEGORIES and len(task.choices) == 27, "all, whatever the file's targets are"
     assert task.environment().begin(episode).target.mask.any()
+    for wrong in (8.5, -1, "8"):
+        path.write_bytes(gzip.compress(json.dumps({"episodes": [{**item, "target_id": wrong}]}).encode()))
+        with pytest.raises(FileError, match=r"episode 0: .*target_id: expected "):
+            AR(episode_file=path)
     del item["target_categrory"]
     path.write_bytes(gzip.compress(json.dumps({"episodes": [item]}).encode()))
     with pytest.raises(FileError, match=r"episodes_AR\.json\.gz: episode 0: .*target_categrory"):
