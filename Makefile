@@ -29,9 +29,10 @@ bench:      ## every speed claim, side by side with what a user would pick inste
 	@scripts/setup test
 	$(BIN)/python tests/benchmark/run_all.py
 
-nightly:    ## what takes too long for every change: the dearest tests, fuzzing, and the small data-scaling study
+nightly:    ## what takes too long for every change: dearest tests, sanitizers, fuzzing, the small data-scaling study
 	@scripts/setup test nightly
 	$(BIN)/python -m pytest -n $(JOBS) --dist loadfile --no-loadscope-reorder -m "nightly or extra"
+	scripts/sanitize
 	@if command -v clang++-$(CLANG) >/dev/null; then scripts/fuzz_compiled; else \
 	  echo "nightly: the compiled readers are not fuzzed, for there is no clang++-$(CLANG)"; fi
 	rm -rf build/nightly

@@ -166,9 +166,7 @@ class Registry:
             if isinstance(error, Error) or is_stop_request(error):
                 raise
             name = what if isinstance(what, str) else getattr(what, "__qualname__", repr(what))
-            raise ConstructionError(
-                f"{self.kind} '{name}' cannot be built: {type(error).__name__}: {read_text(error)}{_locate_error(error)}"
-            ) from error
+            raise ConstructionError(f"{self.kind} '{name}' cannot be built: {_describe_error(error)}") from error
 
     def _list_plugins(self) -> dict[str, Any]:
         return {point.name: point for point in entry_points(group=self.group)} if self.group else {}
@@ -179,9 +177,7 @@ class Registry:
         except BaseException as error:  # SystemExit too: a module must not end the process that imports it
             if is_stop_request(error):
                 raise
-            raise RegistryError(
-                f"{self.kind} '{name}' cannot be loaded: {type(error).__name__}: {read_text(error)}{_locate_error(error)}"
-            ) from error
+            raise RegistryError(f"{self.kind} '{name}' cannot be loaded: {_describe_error(error)}") from error
         return self._check_kind(name, found) if inspect.isclass(found) else found
 
     def _check_kind(self, name: Any, thing: Any) -> Any:
@@ -250,10 +246,11 @@ def _import_file(path: Path) -> Any:
     return module
 
 
-def _locate_error(error: BaseException) -> str:
-    """Return, e.g., " (model.py, line 3)": where an import failed, which the message alone may not say."""
+def _describe_error(error: BaseException) -> str:
+    """Return, e.g., "ImportError: no module (model.py, line 3)": also where it failed, which its text may not say."""
     place = None if isinstance(error, SyntaxError | FileNotFoundError | AttributeError) else find_raising_line(error)
-    return "" if place is None else f" ({Path(place.filename).name}, line {place.lineno})"
+    where = "" if place is None else f" ({Path(place.filename).name}, line {place.lineno})"
+    return f"{type(error).__name__}: {read_text(error)}{where}"
 
 
 WORLD_MODELS = Registry(

@@ -10,7 +10,6 @@ scene. With `--picture FILE` it draws the first window straight ahead instead: t
 from __future__ import annotations
 
 import argparse
-from collections import defaultdict
 from collections.abc import Mapping, Sequence
 from concurrent.futures import ProcessPoolExecutor
 from multiprocessing import get_context
@@ -24,7 +23,16 @@ import wiw
 from wiw import scenes
 from wiw.analysis.intervals import clustered_interval
 from wiw.reproject import pose, warp
-from wiw.training.pocket.held_out import BASELINES, STEPS, Imagine, Window, draw_windows, imagine_by, measure
+from wiw.training.pocket.held_out import (
+    BASELINES,
+    STEPS,
+    Imagine,
+    Window,
+    draw_windows,
+    imagine_by,
+    measure,
+    pair_controls,
+)
 from wiw.training.traversal import STEP_M
 from wiw.world_models.warpnet.model import turn_panorama
 
@@ -65,7 +73,7 @@ def make_models(options: argparse.Namespace) -> dict[str, Imagine]:
 
 
 def measure_scenes(names: Sequence[str], options: argparse.Namespace) -> list[dict[str, Any]]:
-    """Return the rows of some scenes, whose windows walk as another of theirs does where places are shuffled."""
+    """Return the rows of some scenes."""
     import torch
 
     torch.set_num_threads(1)
@@ -88,12 +96,9 @@ def print_table(rows: Sequence[Mapping[str, Any]], kind: str, size: str) -> None
 
 
 def print_gap(rows: Sequence[Mapping[str, Any]], size: str) -> None:
-    """Print how much of the PSNR is lost with the places of another window, over all steps."""
+    """Print how much of the PSNR is lost with the places of another window of the scene, over all steps."""
     for model in dict.fromkeys(row["model"] for row in rows):
-        found: dict[tuple[str, int, int], dict[str, float]] = defaultdict(dict)
-        for row in rows:
-            if row["model"] == model and row["kind"] == "mixed":
-                found[row["scene"], row["window"], row["step"]][row["control"]] = row[size]
+        found = pair_controls(rows, model, size)
         gaps = [pair["true"] - pair["shuffled"] for pair in found.values()]
         low, high = clustered_interval(gaps, [scene for scene, _, _ in found], "length")
         print(f"  {model:<18}{np.mean(gaps):6.2f} [{low:.2f}, {high:.2f}]")

@@ -12,7 +12,7 @@ from wiw.datasets.demonstrations import read_manifest
 from wiw.networks import single_thread
 from wiw.training.armnet import HELD_OUT, HELD_OUT_SEED_OFFSET, Recipe, evaluate, train
 from wiw.training.armnet_events import evaluate_events
-from wiw.training.checkpoint import Checkpoint
+from wiw.training.checkpoint import Checkpoint, require_unfinished
 from wiw.training.plays import gather_plays, merge_plays, read_demonstration_plays
 from wiw.training.preparation import PREPARATION, Preparation, ProgressBar, show_no_bar
 from wiw.world_models.armnet.weights import load, save
@@ -44,9 +44,11 @@ def make_weights(
         bar: shows the progress of recording.
 
     Raises:
-        ArgumentError: a state of another training.
+        ArgumentError: finished weights in the file, or a state of another training.
+        TrainingError: the loss or a gradient is not finite.
         FileError: demonstrations are missing or damaged, or a file cannot be written.
     """
+    require_unfinished(out)
     gathering = preparation.list_arguments(bar)
     plays = gather_plays(count, recipe.seed, **gathering)
     held_out = gather_plays(HELD_OUT, recipe.seed + HELD_OUT_SEED_OFFSET, **gathering)

@@ -81,6 +81,11 @@ class TrainingState:
     state: Mapping[str, Any]
 
 
+def locate_checkpoint(out: Path) -> Path:
+    """Return the checkpoint of the training that writes `out`: the file beside it."""
+    return out.with_name(f"{out.name}.checkpoint")
+
+
 class Checkpoint:
     """A checkpoint file, written about once a minute during training and removed at the end.
 
@@ -99,7 +104,7 @@ class Checkpoint:
     @classmethod
     def beside(cls, out: Path, identity: Mapping[str, Any]) -> Checkpoint:
         """Return the checkpoint of the training that writes `out`, in the file beside it."""
-        return cls(out.with_name(f"{out.name}.checkpoint"), identity)
+        return cls(locate_checkpoint(out), identity)
 
     def load(self) -> TrainingState | None:
         """Read the file; None if there is none.
@@ -167,6 +172,19 @@ class Checkpoint:
     def remove(self) -> None:
         """Delete the file at the end of training."""
         self.path.unlink(missing_ok=True)
+
+
+def require_unfinished(out: Path) -> None:
+    """Check that a training would replace no finished weights: its file is new, or the checkpoint beside it is left.
+
+    Raises:
+        ArgumentError: the file exists, without a checkpoint.
+    """
+    if out.exists() and not locate_checkpoint(out).exists():
+        raise ArgumentError(
+            f"{out} exists, and there is no checkpoint of an unfinished training beside it: training would replace it; "
+            "use it, delete it, or choose another file"
+        )
 
 
 def _is_of_machine(error: Exception) -> bool:

@@ -14,7 +14,7 @@ from wiw.errors import ArgumentError
 from wiw.networks import single_thread
 from wiw.policies.diffuser.weights import save
 from wiw.policies.diffuser.workspace import PinholeCamera
-from wiw.training.checkpoint import Checkpoint
+from wiw.training.checkpoint import Checkpoint, require_unfinished
 from wiw.training.diffuser import Recipe, Samples, extract_samples, train
 from wiw.training.diffuser_paths import measure_paths
 from wiw.training.preparation import ProgressBar, show_no_bar
@@ -39,10 +39,12 @@ def make_weights(
         bar: shows the progress of reading.
 
     Raises:
-        ArgumentError: demonstrations without depth, of views in another size, or that all failed; a state of another
-            training.
+        ArgumentError: demonstrations without depth, of views in another size, or that all failed; finished weights in
+            the file, or a state of another training.
+        TrainingError: the loss or a gradient is not finite.
         FileError: demonstrations are missing or damaged, or a file cannot be written.
     """
+    require_unfinished(out)
     collection = Demonstrations(demonstrations)
     samples, held_out = _read_samples(collection, bar).hold_out()
     card: dict[str, Any] = {"demonstrations": collection.config, "moments": len(samples), "held out": len(held_out)}

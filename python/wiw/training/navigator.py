@@ -24,7 +24,7 @@ from wiw.policies.navigator.bands import BAND_ROWS, GOAL_COLUMNS, GOAL_WIDTH, WI
 from wiw.policies.navigator.estimator import GoalEstimator, PlaceEstimates
 from wiw.policies.navigator.network import DISTANCES, HEADINGS, Estimate, Network, to_input
 from wiw.policies.navigator.weights import load, save
-from wiw.training.checkpoint import Checkpoint, ResumableTrainer
+from wiw.training.checkpoint import Checkpoint, ResumableTrainer, require_unfinished
 from wiw.training.gather import gather_goal_places, require_held_out
 from wiw.training.goal_places import GoalPlaces, PlaceRules
 from wiw.training.preparation import PREPARATION, Preparation, ProgressBar, show_no_bar
@@ -100,10 +100,12 @@ def make_weights(
         bar: shows the progress of recording.
 
     Raises:
-        ArgumentError: scenes that are both trained and evaluated on, or where nobody can walk from place to place; a
-            state of another training.
+        ArgumentError: scenes that are both trained and evaluated on, or where nobody can walk from place to place;
+            finished weights in the file, or a state of another training.
+        TrainingError: the loss or a gradient is not finite.
         FileError: a file cannot be written.
     """
+    require_unfinished(out)
     require_held_out(scenes, val)
     places = gather_goal_places(scenes, recipe.seed, rules, **preparation.list_arguments(bar))
     held_out = gather_goal_places(val, recipe.seed, rules, **preparation.list_arguments(bar))

@@ -22,7 +22,7 @@ from wiw.perception.labelling_network import FINE_CELLS, PIXELS, Network, Pointw
 from wiw.perception.learned_labeller import LearnedLabeller
 from wiw.perception.scene_labels import CATEGORIES, STATES
 from wiw.training import color_naming
-from wiw.training.checkpoint import Checkpoint, ResumableTrainer
+from wiw.training.checkpoint import Checkpoint, ResumableTrainer, require_unfinished
 from wiw.training.gather import gather_views, require_held_out
 from wiw.training.labelled_views import HELD_OUT_FIELD, LabelledViews, ViewRules
 from wiw.training.preparation import PREPARATION, Preparation, ProgressBar, show_no_bar
@@ -111,9 +111,12 @@ def make_weights(
         The card in the file.
 
     Raises:
-        ArgumentError: scenes that are both trained and evaluated on; a state of another training; no such device.
+        ArgumentError: scenes that are both trained and evaluated on; finished weights in the file, or a state of
+            another training; no such device.
+        TrainingError: the loss or a gradient is not finite.
         FileError: a file cannot be written.
     """
+    require_unfinished(out)
     require_held_out(scenes, val)
     device = resolve_device(device)
     gathering = preparation.list_arguments(bar)

@@ -3,7 +3,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+import math
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -20,6 +21,7 @@ from wiw.perception.calibration import calibration_error, fit_temperature, softm
 from wiw.perception.glimpses import EXTENT
 from wiw.perception.recogniser import Recogniser
 from wiw.perception.recognition_network import Network, to_network_input
+from wiw.training.checkpoint import Checkpoint, ResumableTrainer, require_unfinished
 from wiw.training.gather import gather_glimpse_sets, gather_hard_sets, require_held_out
 from wiw.training.glimpse_sets import (
     NEAR,
@@ -32,7 +34,7 @@ from wiw.training.glimpse_sets import (
     split_in_half,
 )
 from wiw.training.preparation import PREPARATION, Preparation, ProgressBar, show_no_bar
-from wiw.training.trainer import run_training, warmup_cosine_schedule
+from wiw.training.trainer import apply_gradients, run_training, warmup_cosine_schedule
 from wiw.typed_values import require_positive
 
 REAL_COLUMN = 4
@@ -93,10 +95,10 @@ def make_weights(
     on_step: Callable[[int, int, float], None] = lambda step, steps, loss: None,
     bar: ProgressBar = show_no_bar,
 ) -> Recogniser:
-    """Record glimpses, train on them, calibrate and evaluate on the halves of held-out scenes, and write the weights.
+    """Record glimpses, train, or resume, calibrate and evaluate on halves of held-out scenes, and write the weights.
 
     Args:
-        out: file of the weights.
+        out: file of the weights; the state of training is kept beside it.
         scenes: training scenes, as in `wiw run --scenes`.
         val: held-out scenes.
         categories: the categories to distinguish.
@@ -113,9 +115,11 @@ def make_weights(
 
     Raises:
         ArgumentError: scenes that are both trained and evaluated on, or have no object of the categories; a start that
-            does not fit.
+            does not fit; finished weights in the file, or a state of another training.
+        TrainingError: the loss or a gradient is not finite.
         FileError: a file cannot be written.
     """
+    require_unfinished(out)
     require_held_out(scenes, val)
     seed, gathering = recipe.seed, preparation.list_arguments(bar)
     sets = gather_glimpse_sets(scenes, categories, seed, rules, **gathering)
@@ -124,11 +128,16 @@ def make_weights(
     calibration, held_out = split_in_half(held_out)
     held_out_hard = gather_hard_sets(val, categories, seed, **gathering)
     samples = merge_glimpse_sets([sets, *[hard] * recipe.hard])
-    network, recipe = train(samples, categories, recipe, minutes, on_step, None if start is None else start.network)
-    card = {"scenes": scenes, "val": val, "sets": len(sets), "hard_sets": len(hard)}
-    card |= {"looks": asdict(rules), "recipe": asdict(recipe), "began_with": None if start is None else start.card}
+    card: dict[str, Any] = {"scenes": scenes, "val": val, "sets": len(sets), "hard_sets": len(hard)}
+    card |= {"looks": asdict(rules), "began_with": None if start is None else start.card}
+    resumable = {**card, "recipe": asdict(recipe), "minutes": minutes, "categories": list(categories)}
+    checkpoint = Checkpoint.beside(out, resumable)
+    network = None if start is None else start.network
+    network, recipe = train(samples, categories, recipe, minutes, on_step, network, checkpoint)
+    card |= {"recipe": asdict(recipe)}
     calibrated = calibrate(network, categories, calibration, held_out, card, held_out_hard)
     calibrated.save(out)
+    checkpoint.remove()
     return calibrated
 
 
@@ -139,6 +148,7 @@ def train(
     minutes: float | None = None,
     on_step: Callable[[int, int, float], None] = lambda step, steps, loss: None,
     start: Network | None = None,
+    checkpoint: Checkpoint | None = None,
 ) -> tuple[Network, Recipe]:
     """Train a network; return it with the recipe that reproduces it without a time limit.
 
@@ -149,6 +159,7 @@ def train(
         minutes: if given, reduces the number of epochs so that training takes about this long.
         on_step: called after each step with its number, the number of all steps and a running mean of the loss.
         start: network of the same kind whose training continues; None for a new one.
+        checkpoint: where the state of training is saved, and from where it resumes.
 
     Raises:
         ArgumentError: `start` has other categories, another width, or is told sizes where this one is not.
@@ -167,12 +178,15 @@ def train(
         minutes,
         warmup_cosine_schedule(0.15, 0.01),
         on_step,
+        checkpoint,
     )
     return trainer.network.eval(), recipe
 
 
-class _Trainer:
+class _Trainer(ResumableTrainer):
     """The network in training, with everything that its next step depends on."""
+
+    stateful_parts = ("network", "optimiser")
 
     def __init__(
         self, data: GlimpseSets, categories: Sequence[str], recipe: Recipe, start: Network | None = None
@@ -183,37 +197,46 @@ class _Trainer:
         self.network = network.to(memory_format=torch.channels_last)  # type: ignore[call-overload]
         if start is not None:
             self.network.load_state_dict(start.state_dict())
-        self._rng = np.random.default_rng(core.fold_key([recipe.seed, 0x4C02]))
-        self._optimiser = torch.optim.AdamW(self.network.parameters(), recipe.rate, weight_decay=recipe.decay)
+        self.optimiser = torch.optim.AdamW(self.network.parameters(), recipe.rate, weight_decay=recipe.decay)
         self._sampling_weights = _compute_sampling_weights(data.labels)
         self._confusion = np.full((len(categories), len(categories)), 1 / len(categories))
 
     def train_step(self, learning_rate: float) -> float:
         """Train on one batch of glimpse sets and return its loss."""
-        for group in self._optimiser.param_groups:
-            group["lr"] = learning_rate
-        sets = self._draw_sets()
-        loss, shares = _compute_loss(self.network, self.data, sets, self.recipe, self._rng)
+        key = core.fold_key([self.recipe.seed, 0x4C02, self.step_count])
+        rng = np.random.default_rng(key)
+        torch.manual_seed(key % 2**63)  # of dropout
+        sets = self._draw_sets(rng)
+        loss, shares = _compute_loss(self.network, self.data, sets, self.recipe, rng)
         for label, row in zip(self.data.labels[sets], shares, strict=True):
             self._confusion[label] += CONFUSION_RATE * (row - self._confusion[label])
-        self._optimiser.zero_grad(set_to_none=True)
         loss.backward()
-        self._optimiser.step()
+        apply_gradients(self.optimiser, self.network, learning_rate, math.inf)
+        self.step_count += 1
         return float(loss.detach())
 
-    def _draw_sets(self) -> NDArray[np.int64]:
+    def state_dict(self) -> dict[str, Any]:
+        """Return everything that the next step depends on, except the data and the recipe."""
+        return {**super().state_dict(), "confusion": torch.from_numpy(self._confusion)}
+
+    def load_state_dict(self, state: Mapping[str, Any]) -> None:
+        """Resume from a state that `state_dict` returned."""
+        super().load_state_dict(state)
+        self._confusion = state["confusion"].numpy().copy()
+
+    def _draw_sets(self, rng: np.random.Generator) -> NDArray[np.int64]:
         """Draw a batch of hard pairs: a set, and one of a category that its own is at present confused with."""
         half = (self.recipe.batch + 1) // 2
-        first = self._rng.choice(len(self.data), half, p=self._sampling_weights)
-        paired = [self._draw_confused(int(label)) for label in self.data.labels[first]]
+        first = rng.choice(len(self.data), half, p=self._sampling_weights)
+        paired = [self._draw_confused(int(label), rng) for label in self.data.labels[first]]
         return np.concatenate([first, paired])[: self.recipe.batch]
 
-    def _draw_confused(self, label: int) -> int:
+    def _draw_confused(self, label: int, rng: np.random.Generator) -> int:
         weights = self._confusion[label][self.data.labels] * self._sampling_weights
         weights[self.data.labels == label] = 0
         if not weights.any():  # there is one category alone
             weights = self._sampling_weights
-        return int(self._rng.choice(len(self.data), p=weights / weights.sum()))
+        return int(rng.choice(len(self.data), p=weights / weights.sum()))
 
 
 def _compute_sampling_weights(labels: NDArray[np.int64]) -> NDArray[np.float64]:

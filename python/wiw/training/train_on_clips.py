@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 
 import wiw
 from wiw.datasets.navigation import NavigationData, Part
-from wiw.errors import WeightsError
+from wiw.errors import ArgumentError, WeightsError
 from wiw.files import atomic_file
 from wiw.networks import describe_device, memory_guard, resolve_device
 from wiw.training.held_out_clips import Frames, Imagine, imagine_with
@@ -61,7 +61,7 @@ def train_on_clips(
     A state is kept beside `out`, in `OUT.checkpoint`, every so often, at SIGUSR1, and before the process stops at
     SIGTERM or Ctrl-C. The same call resumes from it; on the CPU, with the same number of threads, it ends with the same
     bytes.
-    Once it has written `out`, it returns that file's card, until the weights are measured (`held_out` in the card).
+    Once it has written `out`, it trains no more and returns that file's card.
     `OUT.log` has the loss of each step and what validations found.
 
     Args:
@@ -85,8 +85,8 @@ def train_on_clips(
 
     Raises:
         ArgumentError: an unknown model or device; a dataset of perspective views, of scenes for evaluation or, for
-            warpnet, without depth; too few clips; a state of a training with other data or numbers; or validation or
-            decisions on scenes that are trained on or not there.
+            warpnet, without depth; too few clips; a state of a training with other data or numbers; weights in `out`
+            that another training has written; or validation or decisions on scenes that are trained on or not there.
         TrainingError: the loss is not finite; the last good state is kept, the message names the batch.
         FileError: the dataset is missing, incomplete or damaged, or a file cannot be written.
         DeviceMemoryError: memory does not suffice.
@@ -111,8 +111,8 @@ def train_on_clips(
         checked = build_validation_set(held_out, chosen, decisions, recipe)
     card: dict[str, Any] = {"wiw": wiw.__version__, "data": corpus.describe(), "recipe": recipe.describe()}
     card |= {"validated_on": checked.identity if checked else None}
-    if (finished := _read_finished(learner, out, card)) is not None:
-        return finished
+    if out.exists():
+        return _read_finished(learner, out, card)
     frames = reduce_frames(dataset, recipe.clip_size, cache, bar)
     state = SignalledCheckpoint(out.with_name(f"{out.name}.checkpoint"), {"model": name, **card}, seconds)
     remedies = f"lower batch (now {recipe.batch}), or choose a smaller size or network"
@@ -150,14 +150,25 @@ def create_sampler(learner: Learner, trainer: PlaceTrainer) -> Imagine:
     return imagine_now
 
 
-def _read_finished(learner: Learner, out: Path, identity: Mapping[str, Any]) -> dict[str, Any] | None:
-    """Return the card of weights that the same training has written and nobody has measured; None if there are none."""
+def _read_finished(learner: Learner, out: Path, identity: Mapping[str, Any]) -> dict[str, Any]:
+    """Return the card of weights that the same training has written.
+
+    Raises:
+        ArgumentError: it was another one, or the file has no such weights.
+    """
     try:
         card = learner.load(out)[1]
-    except WeightsError:
-        return None
-    same = all(card.get(name) == value for name, value in json.loads(json.dumps(identity)).items())
-    return card if same and "held_out" not in card else None
+    except WeightsError as error:
+        raise ArgumentError(
+            f"{out} exists and would be replaced: choose another file, or delete it ({error})"
+        ) from error
+    others = [name for name, value in json.loads(json.dumps(identity)).items() if card.get(name) != value]
+    if others:
+        raise ArgumentError(
+            f"{out} has the weights of another training (of other {', '.join(others)}), which would be replaced; "
+            "choose another file, or delete it"
+        )
+    return card
 
 
 def _save_best(learner: Learner, folder: Path, trainer: PlaceTrainer, found: Mapping[str, Any]) -> None:

@@ -14,7 +14,7 @@ from torch.nn import Module
 from torch.nn.utils import clip_grad_norm_
 from torch.optim import Optimizer
 
-from wiw.errors import ArgumentError
+from wiw.errors import ArgumentError, TrainingError
 from wiw.training.checkpoint import Checkpoint, ResumableTrainer
 
 
@@ -54,6 +54,7 @@ def run_training(
 
     Raises:
         ArgumentError: `minutes` is not above 0.
+        TrainingError: the loss or a gradient is not finite; the last state that was written is kept.
     """
     if minutes is not None and not (minutes > 0 and math.isfinite(minutes)):
         raise ArgumentError(f"minutes: expected a finite number above 0, got {minutes}")
@@ -70,7 +71,7 @@ def run_training(
         first = resumed.step
         resumed = None  # frees its copy of the state
     for step in range(first, steps):
-        loss = trainer.train_step(recipe.rate * schedule(step / steps))
+        loss = _take_step(trainer, recipe.rate * schedule(step / steps), step + 1)
         mean = loss if step == first else 0.98 * mean + 0.02 * loss
         on_step(step + 1, steps, mean)
         if checkpoint:
@@ -78,11 +79,29 @@ def run_training(
     return trainer, recipe
 
 
-def apply_gradients(optimiser: Optimizer, network: Module, learning_rate: float) -> None:
-    """Update weights at a learning rate by their gradients, those of the network clipped to norm 1; clear these."""
+def _take_step(trainer: Trainer, learning_rate: float, number: int) -> float:
+    try:
+        loss = trainer.train_step(learning_rate)
+        if not math.isfinite(loss):
+            raise FloatingPointError("the loss")
+    except FloatingPointError as error:
+        raise TrainingError(
+            f"step {number}: {error} is not finite. The last state that was written is from before this step, whose "
+            "batch depends only on the seed and its number. Train with a lower rate or another seed"
+        ) from error
+    return loss
+
+
+def apply_gradients(optimiser: Optimizer, network: Module, learning_rate: float, largest: float = 1.0) -> None:
+    """Update weights at a learning rate by their gradients, those of the network clipped to a norm; clear these.
+
+    Raises:
+        FloatingPointError: a gradient of the network is not finite; the weights are as they were.
+    """
+    if not clip_grad_norm_(network.parameters(), largest).isfinite():
+        raise FloatingPointError("a gradient")
     for group in optimiser.param_groups:
         group["lr"] = float(learning_rate)
-    clip_grad_norm_(network.parameters(), 1.0)
     optimiser.step()
     optimiser.zero_grad(set_to_none=True)
 

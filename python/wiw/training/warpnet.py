@@ -19,6 +19,7 @@ from wiw.datasets.worlds import world
 from wiw.errors import ArgumentError
 from wiw.networks import autocast_bfloat16
 from wiw.reproject import pose, warp
+from wiw.training.checkpoint import Checkpoint, ResumableTrainer, require_unfinished
 from wiw.training.gather import gather_walks, require_held_out
 from wiw.training.preparation import PREPARATION, Preparation, ProgressBar, show_no_bar
 from wiw.training.reduced_frames import compute_log_distances
@@ -73,10 +74,10 @@ def make_weights(
     on_step: Callable[[int, int, float], None] = lambda step, steps, loss: None,
     bar: ProgressBar = show_no_bar,
 ) -> dict[str, Any]:
-    """Record walks, train on them, evaluate on held-out scenes, and write the weights; return the file's card.
+    """Record walks, train on them, or resume, evaluate on held-out scenes, and write the weights; return the card.
 
     Args:
-        out: file of the weights.
+        out: file of the weights; the state of training is kept beside it.
         scenes: training scenes, as in `wiw run --scenes`.
         val: held-out scenes.
         rules: which walks are recorded.
@@ -87,17 +88,22 @@ def make_weights(
         bar: shows the progress of recording and evaluation.
 
     Raises:
-        ArgumentError: scenes that are both trained and evaluated on, or where nobody can walk straight ahead.
+        ArgumentError: scenes that are both trained and evaluated on, or where nobody can walk straight ahead; finished
+            weights in the file, or a state of another training.
+        TrainingError: the loss or a gradient is not finite.
         FileError: a file cannot be written.
     """
+    require_unfinished(out)
     require_held_out(scenes, val)
     walks = gather_walks(scenes, recipe.seed, rules, **preparation.list_arguments(bar))
-    network, recipe = train(walks, recipe, minutes, on_step)
-    card: dict[str, Any] = {"scenes": scenes, "val": val, "ways": len(walks)}
-    card |= {"walks": asdict(rules), "recipe": asdict(recipe)}
+    card: dict[str, Any] = {"scenes": scenes, "val": val, "ways": len(walks), "walks": asdict(rules)}
+    checkpoint = Checkpoint.beside(out, {**card, "recipe": asdict(recipe), "minutes": minutes})
+    network, recipe = train(walks, recipe, minutes, on_step, checkpoint)
+    card |= {"recipe": asdict(recipe)}
     save(out, network, card)  # before the evaluation, which takes another minute
     card["held_out"] = evaluate(WarpNet(out), val, recipe.seed, bar=bar)
     save(out, load(out)[0], card)
+    checkpoint.remove()
     return card
 
 
@@ -106,6 +112,7 @@ def train(
     recipe: Recipe = Recipe(),
     minutes: float | None = None,
     on_step: Callable[[int, int, float], None] = lambda step, steps, loss: None,
+    checkpoint: Checkpoint | None = None,
 ) -> tuple[Network, Recipe]:
     """Train a network; return it with the recipe that reproduces it without a time limit.
 
@@ -114,32 +121,42 @@ def train(
         recipe: how to train; see `Recipe`.
         minutes: if given, reduces the number of epochs so that training takes about this long.
         on_step: called after each step with its number, the number of all steps and a running mean of the loss.
+        checkpoint: where the state of training is saved, and from where it resumes.
     """
     steps_per_epoch = max(1, walks.places.size // recipe.batch)
     trainer, recipe = run_training(
-        lambda: _Trainer(walks, recipe), recipe, steps_per_epoch, minutes, warmup_cosine_schedule(0.05), on_step
+        lambda: _Trainer(walks, recipe),
+        recipe,
+        steps_per_epoch,
+        minutes,
+        warmup_cosine_schedule(0.05),
+        on_step,
+        checkpoint,
     )
     return trainer.network.eval(), recipe
 
 
-class _Trainer:
+class _Trainer(ResumableTrainer):
     """The network in training, with everything that its next step depends on."""
+
+    stateful_parts = ("network", "optimiser")
 
     def __init__(self, walks: Walks, recipe: Recipe) -> None:
         torch.manual_seed(core.fold_key([recipe.seed, 0x4C11]) % 2**63)
         self.walks, self.recipe = walks, recipe
         self.network = Network(walks.images.shape[2], recipe.widths)
-        self._rng = np.random.default_rng(core.fold_key([recipe.seed, 0x4C12]))
-        self._optimiser = torch.optim.AdamW(self.network.parameters(), recipe.rate, weight_decay=recipe.decay)
+        self.optimiser = torch.optim.AdamW(self.network.parameters(), recipe.rate, weight_decay=recipe.decay)
 
     def train_step(self, learning_rate: float) -> float:
         """Train on one batch of pairs and return its loss."""
-        pairs = sample_pairs(self.walks, self.recipe.batch, self._rng)
+        rng = np.random.default_rng(core.fold_key([self.recipe.seed, 0x4C12, self.step_count]))
+        pairs = sample_pairs(self.walks, self.recipe.batch, rng)
         with autocast_bfloat16("cpu", self.recipe.bfloat16):
             found = self.network.train()(pairs.source, pairs.ahead)
         loss = compute_losses(found, pairs, self.recipe).mean()
         loss.backward()
-        apply_gradients(self._optimiser, self.network, learning_rate)
+        apply_gradients(self.optimiser, self.network, learning_rate)
+        self.step_count += 1
         return float(loss.detach())
 
 

@@ -4,6 +4,7 @@
 from __future__ import annotations
 
 import errno
+import math
 import signal
 import weakref
 from dataclasses import dataclass
@@ -16,10 +17,10 @@ pytest.importorskip("torch", reason="needs wiw[torch]")
 
 import torch
 
-from wiw.errors import FileError
+from wiw.errors import FileError, TrainingError
 from wiw.training.checkpoint import Checkpoint, ResumableTrainer, TrainingState, _StateFile
 from wiw.training.post_training.stop_signals import SignalledCheckpoint
-from wiw.training.trainer import run_training
+from wiw.training.trainer import apply_gradients, run_training
 
 
 class Counter(ResumableTrainer):
@@ -104,6 +105,43 @@ def test_a_resumed_training_keeps_no_second_copy_of_its_state(monkeypatch: pytes
 
 class StoppedError(Exception):
     """Raised by the handler that was there before."""
+
+
+def test_the_state_before_a_loss_that_is_not_finite_is_kept(tmp_path: Path) -> None:
+    class Diverging(Counter):
+        def train_step(self, learning_rate: float) -> float:
+            super().train_step(learning_rate)
+            return math.nan if self.step_count == 3 else 0.0
+
+    checkpoint = Checkpoint(tmp_path / "state", {}, seconds=0)
+    with pytest.raises(TrainingError, match="step 3: the loss is not finite"):
+        run_training(Diverging, Recipe(), 4, None, lambda _: 1.0, lambda *_: None, checkpoint)
+    found = checkpoint.load()
+    assert found is not None and found.step == 2
+
+
+def test_a_gradient_that_is_not_finite_changes_no_weight(tmp_path: Path) -> None:
+    class Sudden(ResumableTrainer):
+        stateful_parts = ("network", "optimiser")
+
+        def __init__(self) -> None:
+            self.network = torch.nn.Linear(2, 1)
+            self.optimiser = torch.optim.AdamW(self.network.parameters())
+
+        def train_step(self, learning_rate: float) -> float:
+            loss = self.network(torch.ones(1, 2)).sum().square()
+            loss.backward()
+            if self.step_count == 1:
+                self.before = [value.detach().clone() for value in self.network.parameters()]
+                self.network.weight.grad[0, 0] = math.inf
+            apply_gradients(self.optimiser, self.network, learning_rate)
+            self.step_count += 1
+            return float(loss.detach())
+
+    trainer = Sudden()
+    with pytest.raises(TrainingError, match="step 2: a gradient is not finite"):
+        run_training(lambda: trainer, Recipe(), 2, None, lambda _: 0.1, lambda *_: None)
+    assert all(map(torch.equal, trainer.network.parameters(), trainer.before))
 
 
 @pytest.mark.parametrize("later", [signal.SIGUSR1, None])

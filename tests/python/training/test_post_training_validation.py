@@ -207,22 +207,35 @@ def test_a_training_that_is_stopped_while_it_validates_ends_with_the_same_bytes(
     require_same_bytes_when_stopped_at_sample(5, 4, train, tmp_path, monkeypatch)
 
 
-@pytest.mark.parametrize("steps", [4, 6])
-def test_best_weights_of_a_step_that_is_to_come_are_forgotten(steps: int, tmp_path: Path) -> None:
+@pytest.mark.parametrize("psnr", [8.0, 10.0])
+def test_best_weights_of_a_step_that_is_to_come_stay_until_better_ones_are_found(psnr: float, tmp_path: Path) -> None:
     class Resumed:
         step_count = 0
+        recipe = types.SimpleNamespace(seed=0)
 
         def load_state_dict(self, state: Any) -> None:
             self.step_count = state["count"]
+
+    class Checked:
+        every = 2
+
+        def measure(self, *_: Any) -> Any:
+            return {"psnr": psnr}, np.zeros((2, 2, 3), np.uint8)
+
+    def save(folder: Path, found: Any) -> None:
+        (folder / "training.json").write_text(json.dumps(found))
 
     log = TrainingLog(tmp_path / "metrics.jsonl")
     for step in (2, 4, 6):
         log.write(step, {"validation/psnr": float(step)})
     (tmp_path / "best").mkdir()
-    (tmp_path / "best" / "training.json").write_text(json.dumps({"steps": steps, "validation": {"psnr": 9.0}}))
-    resumed = ValidatedTrainer(Resumed(), None, None, log, lambda *_: None)  # type: ignore[arg-type]
+    save(tmp_path / "best", {"steps": 6, "validation": {"psnr": 9.0}})
+    resumed = ValidatedTrainer(Resumed(), lambda *_: None, Checked(), log, save)  # type: ignore[arg-type]
     resumed.load_state_dict({"count": 4})
-    assert [line["step"] for line in log.read()] == [2, 4] and resumed.best.exists() == (steps == 4)
+    assert [line["step"] for line in log.read()] == [2, 4]
+    resumed.trainer.step_count = 6
+    resumed.validate()  # on a GPU, with other weights than before it was stopped
+    assert json.loads((resumed.best / "training.json").read_text())["validation"]["psnr"] == max(psnr, 9.0)
 
 
 def test_a_log_forgets_what_comes_later_and_half_a_line(tmp_path: Path) -> None:
@@ -260,7 +273,13 @@ def test_trackers_are_told_what_the_log_is(name: str, train: Any, tmp_path: Path
     told: list[Any] = []
     package = types.ModuleType(name)
     package.__spec__ = types.SimpleNamespace()  # type: ignore[assignment]
-    package.init = lambda project, **_: _Run(told, project)  # type: ignore[attr-defined]
+    begun: list[dict[str, Any]] = []
+
+    def init(project: str, **options: Any) -> _Run:
+        begun.append(options)
+        return _Run(told, project)
+
+    package.init = init  # type: ignore[attr-defined]
     package.config = types.SimpleNamespace(update=lambda values, **_: told.append(values))  # type: ignore[attr-defined]
     monkeypatch.setitem(sys.modules, name, package)
     train(tmp_path / "out", tracker=name, numbers={"epochs": 2})
@@ -268,6 +287,10 @@ def test_trackers_are_told_what_the_log_is(name: str, train: Any, tmp_path: Path
     assert config["rate"] == 1e-5 and config["size"] == "[64, 128]" and end == "finished"
     log = [{**line} for line in read_log(tmp_path / "out")]
     assert rest == [(line.pop("step"), {k: v for k, v in line.items() if k != "seconds"}) for line in log]
+    open_tracker(name, "out", tmp_path / "out.log", {})  # as when it resumes
+    open_tracker(name, "out", tmp_path / "other.log", {})
+    first, resumed, other = (options.get("id") or options["name"] for options in begun)
+    assert first == resumed != other and all(options["resume"] == "allow" for options in begun)
 
 
 @pytest.mark.extra

@@ -7,6 +7,7 @@ import json
 import math
 import shutil
 from contextlib import nullcontext
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -27,7 +28,7 @@ from wiw.training.held_out_panoramas import select_panoramas  # noqa: E402
 from wiw.training.learners import make_learner  # noqa: E402
 from wiw.training.place_trainer import PlaceTrainer  # noqa: E402
 from wiw.training.pocket.batches import compute_displacements, draw_batch, draw_places  # noqa: E402
-from wiw.training.pocket.held_out import BASELINES, draw_windows, measure, shuffle_places  # noqa: E402
+from wiw.training.pocket.held_out import BASELINES, draw_windows, measure, pair_controls, shuffle_places  # noqa: E402
 from wiw.training.pocket.recipe import PocketRecipe  # noqa: E402
 from wiw.training.pocket.trainer import PocketTrainer, average_sphere  # noqa: E402
 from wiw.training.post_training.corpora import NavigationCorpus  # noqa: E402
@@ -256,6 +257,19 @@ def test_windows_show_what_their_trajectories_say(two_rooms: str) -> None:
     assert mean["one room"] > mean["rolled"] >= mean["copy"]
     rolled = {row["control"]: row["psnr"] for row in rows if row["model"] == "rolled" and row["window"] == 0}
     assert rolled["true"] == rolled["shuffled"]  # turns are the window's own
+    elsewhere = [replace(window, scene="another", image=window.image // 2) for window in windows]
+    assert [row for row in measure([*elsewhere, *windows], BASELINES, 0) if row["scene"] != "another"] == rows
+
+
+def test_places_that_happen_to_be_the_same_do_not_count_in_the_gap(two_rooms: str) -> None:
+    one = next(window for window in draw_windows(two_rooms, 1, 0) if window.kind == "mixed")
+    assert {row["control"] for row in measure([one], BASELINES, 0)} == {"true"}, "there is no other"
+    places = one.trajectory.copy()
+    places[2:, 0] += 0.3
+    rows = list(measure([one, replace(one, trajectory=places)], BASELINES, 0))
+    assert {row["step"] for row in rows if row["control"] == "shuffled"} == set(one.truth) - {1}
+    paired = pair_controls(rows, "one room", "psnr")
+    assert {step for _, _, step in paired} == set(one.truth) - {1} and len(paired) == 2 * len(set(one.truth) - {1})
 
 
 def test_shuffled_windows_walk_as_another_does(two_rooms: str) -> None:
@@ -290,7 +304,7 @@ def test_the_command_trains_measures_and_is_run(
     val = shutil.copy(two_rooms, tmp_path / "another.obj")
     monkeypatch.setattr("wiw.training.pocket.held_out.evaluate", fail)
     assert main([*command, "--val", str(val)]) == 2 and "held_out" not in Pocket(out).card
-    monkeypatch.setattr("wiw.training.pocket.held_out.evaluate", partial(evaluate, count=1))
+    monkeypatch.setattr("wiw.training.pocket.held_out.evaluate", partial(evaluate, count=2))
     with monkeypatch.context() as patch:
         patch.setattr(PocketTrainer, "train_step", None)  # what is trained is not trained again, but measured
         assert main([*command, "--val", str(val)]) == 0
@@ -300,6 +314,13 @@ def test_the_command_trains_measures_and_is_run(
     assert card["steps"] == 2 and set(card["held_out"]) == {"mixed", "straight"}
     assert set(card["held_out"]["mixed"]["psnr"]) == {"copy", "rolled", "one room", "pocket"}
     assert not list(tmp_path.glob("*.checkpoint"))
+    with monkeypatch.context() as patch:
+        patch.setattr(PocketTrainer, "train_step", None)
+        patch.setattr("wiw.training.pocket.held_out.evaluate", None)
+        assert main([*command, "--val", str(val)]) == 0 and "trained and measured before" in capsys.readouterr().out
+        assert main([*command, "--val", str(val), "--seed", "1"]) == 2
+    assert f"{out} has the weights of another training (of other recipe)" in capsys.readouterr().err
+    assert Pocket(out).card == card and Path(f"{out}.log").exists()
     preset = tmp_path / "short.yaml"
     preset.write_text("base: paper\ndecisions: 2\n")
     command = ["run", "imagenav", "--scenes", two_rooms, "--preset", str(preset), "--episodes", "1", "--no-report"]

@@ -117,7 +117,8 @@ def test_calibration_lowers_the_error_of_confidence(lesson: Any) -> None:
     assert modest.card["calibration_error"]["after"] < 0.7 * modest.card["calibration_error"]["before"]
 
 
-def test_the_same_lesson_gives_the_same_network() -> None:
+def test_the_same_lesson_gives_the_same_network_stopped_or_not(tmp_path: Path) -> None:
+    from wiw.training.checkpoint import Checkpoint
     from wiw.training.recogniser import Recipe, train
 
     looks = made_up(40, 5)
@@ -126,6 +127,18 @@ def test_the_same_lesson_gives_the_same_network() -> None:
     )
     assert all(torch.equal(once[name], again[name]) for name in once)
     assert not torch.equal(once["logits.weight"], other["logits.weight"])
+    checkpoint = Checkpoint(tmp_path / "kept", {}, seconds=0)
+
+    def cut(step: int, steps: int, loss: float) -> None:
+        if step == 4:
+            raise KeyboardInterrupt
+
+    recipe = Recipe(epochs=2, batch=10, width=4, seed=1)
+    with pytest.raises(KeyboardInterrupt):
+        train(looks, NAMES, recipe, on_step=cut, checkpoint=checkpoint)
+    assert checkpoint.load().step == 3
+    resumed = train(looks, NAMES, recipe, checkpoint=checkpoint)[0].state_dict()
+    assert all(torch.equal(once[name], resumed[name]) for name in once)
     hurried = train(looks, NAMES, Recipe(epochs=500, batch=10, width=4, seed=1), minutes=0.5 / 60)[1]
     assert 1 <= hurried.epochs < 500
     with pytest.raises(ArgumentError, match="epochs"):
@@ -232,7 +245,7 @@ def test_batches_are_pairs_of_categories_that_are_confused() -> None:
     looks = made_up(90, 2)
     trainer = _Trainer(looks, NAMES, Recipe(batch=60, width=4))
     trainer._confusion = np.array([[0.1, 0.9, 0.0], [0.9, 0.1, 0.0], [0.5, 0.5, 0.0]])
-    first, second = looks.labels[trainer._draw_sets()].reshape(2, 30)
+    first, second = looks.labels[trainer._draw_sets(np.random.default_rng(0))].reshape(2, 30)
     assert {(a, b) for a, b in zip(first, second, strict=True)} == {(0, 1), (1, 0), (2, 0), (2, 1)}
     before = trainer._confusion.copy()
     trainer.train_step(1e-3)
@@ -335,6 +348,9 @@ def test_the_command_trains_on_apartments(
     whole = [file.read_bytes() for file in made]
     made[0].write_bytes(whole[0][:1000])
     before = made[2].stat().st_mtime_ns
+    assert main([*command, *options, "--epochs", "1"]) == 2
+    assert f"{out} exists, and there is no checkpoint" in capsys.readouterr().err
+    options[1] = str(tmp_path / "others.safetensors")
     assert main([*command, *options, "--epochs", "1"]) == 0
     assert np.load(made[0])["images"].tobytes() == np.load(_written(tmp_path, whole[0]))["images"].tobytes()
     assert made[2].stat().st_mtime_ns == before

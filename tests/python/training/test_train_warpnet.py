@@ -22,6 +22,7 @@ from wiw.training.collect_navigation import collect_navigation
 
 torch = pytest.importorskip("torch", reason="needs wiw[torch]")
 
+from wiw.training.checkpoint import Checkpoint  # noqa: E402
 from wiw.training.held_out_panoramas import select_panoramas  # noqa: E402
 from wiw.training.post_training.corpora import NavigationCorpus  # noqa: E402
 from wiw.training.post_training.recipe import load_recipe  # noqa: E402
@@ -74,12 +75,25 @@ def test_a_pair_is_a_way_ahead(walks: Walks) -> None:
     assert error.mean() < 0.6 * still.mean()
 
 
-def test_the_same_lesson_gives_the_same_network(walks: Walks) -> None:
+def test_the_same_lesson_gives_the_same_network_stopped_or_not(walks: Walks, tmp_path: Path) -> None:
     once, again, other = (
         train(walks, Recipe(epochs=1, batch=10, widths=(4, 4, 4), seed=seed))[0].state_dict() for seed in (1, 1, 2)
     )
     assert all(torch.equal(once[name], again[name]) for name in once)
     assert not torch.equal(once["distance.last.weight"], other["distance.last.weight"])
+    checkpoint = Checkpoint(tmp_path / "kept", {}, seconds=0)
+
+    def cut(step: int, steps: int, loss: float) -> None:
+        if step == 2:
+            raise KeyboardInterrupt
+
+    recipe = Recipe(epochs=2, batch=10, widths=(4, 4, 4), seed=1)
+    whole = train(walks, recipe)[0].state_dict()
+    with pytest.raises(KeyboardInterrupt):
+        train(walks, recipe, on_step=cut, checkpoint=checkpoint)
+    assert checkpoint.load().step == 1
+    resumed = train(walks, recipe, checkpoint=checkpoint)[0].state_dict()
+    assert all(torch.equal(whole[name], resumed[name]) for name in whole)
     hurried = train(walks, Recipe(epochs=500, batch=10, widths=(4, 4, 4)), minutes=0.5 / 60)[1]
     assert 1 <= hurried.epochs < 500
     with pytest.raises(ArgumentError, match="epochs"):
@@ -118,6 +132,9 @@ def test_the_command_makes_a_model_that_beats_the_floor(
     assert [file.suffix for file in cache.iterdir()] == [".npz"]
 
     before = {file: file.stat().st_mtime_ns for file in cache.iterdir()}
+    assert main([*command, *options, "--epochs", "1"]) == 2
+    assert f"{out} exists, and there is no checkpoint" in capsys.readouterr().err
+    options[1] = str(tmp_path / "others.safetensors")
     assert main([*command, *options, "--epochs", "1"]) == 0
     assert before == {file: file.stat().st_mtime_ns for file in cache.iterdir()}
 
@@ -148,10 +165,13 @@ def test_it_trains_on_a_dataset_and_resumes(
     val = shutil.copy(two_rooms, tmp_path / "another.obj")
     monkeypatch.setattr("wiw.training.warpnet.evaluate", partial(evaluate, paths=1))
 
+    numbers = tmp_path / "numbers.yaml"
+    numbers.write_text("".join(f"{number.replace('=', ': ')}\n" for number in SMALL))
+
     def run(out: Path) -> int:
         command = ["train", "warpnet", "--data", str(dataset), "--part", "all", "--val", str(val), "--out", str(out)]
         command += ["--cache", str(tmp_path / "cache"), "--epochs", "4"]
-        return main([*command, *(each for number in SMALL for each in ("--option", number))])
+        return main([*command, "--recipe", str(numbers)])
 
     if read_meta(dataset)["depth"] is None:
         assert run(tmp_path / "blind") == 2
@@ -210,6 +230,9 @@ def fail_at(step: int) -> Any:
     [
         (["--option", "clips=4"], "--option has no effect on a training on walks; they go with --data"),
         (["--validation", "other"], "--validation has no effect on a training on walks"),
+        (["--recipe", "r.yaml"], "--recipe has no effect on a training on walks"),
+        (["--tracker", "wandb"], "--tracker has no effect on a training on walks"),
+        (["--decisions", "made"], "--decisions has no effect on a training on walks"),
         (["--data", "d", "--places", "3"], "--places has no effect on a training on --data"),
         (["--data", "d", "--minutes", "3"], "--minutes has no effect on a training on --data"),
         (["--data", "d", "--workers", "3"], "--workers has no effect on a training on --data"),

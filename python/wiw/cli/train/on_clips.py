@@ -57,6 +57,9 @@ def train_and_measure(
             bar=track_items,
             **watched,
         )
+    if card.get("val") == val and "held_out" in card:
+        print(f"{out}: trained and measured before; delete it to train anew")
+        return card
     learner = make_learner(name)
     card["val"] = val
     card["held_out"] = evaluate(learner.model(out), val, recipe.seed, bar=track_items)

@@ -35,7 +35,8 @@ def train_recogniser(
     $ wiw run ar --policy-option weights=house.safetensors
 
     Views of the scenes are rendered and cached first, so that an interrupted command does not render them again.
-    Training takes 15 to 30 minutes on two idle cores. FILE also holds the recipe, and accuracy and calibration error on
+    Training takes 15 to 30 minutes on two idle cores, and resumes when the command is repeated; finished weights are
+    never replaced. FILE also holds the recipe, and accuracy and calibration error on
     one half of the val scenes, after calibration on the other half. Of the weights shipped with wiw, `extents` were
     trained by this recipe with --scenes apartments:train:80, `pictures` by an earlier one (docs/results.md).
 

@@ -10,7 +10,7 @@ from typing import Annotated, Any, Literal
 from tyro.conf import arg
 
 from wiw.cli.options import Options
-from wiw.cli.train.corpus import describe_steps
+from wiw.cli.train.corpus import TrackerName, describe_steps
 from wiw.cli.train.on_clips import train_and_measure
 from wiw.cli.train.progress import TrainingProgress, track_items
 from wiw.cli.train.small_networks import NO_LIMITS, VAL_SCENES, Count, Limits, check_counts, drop_none, write_weights
@@ -30,9 +30,12 @@ def train_warpnet(
     places: Count = None,
     epochs: Count = None,
     limits: Annotated[Limits, arg(name="")] = NO_LIMITS,
+    recipe: Annotated[Path | None, arg(metavar="YAML", help_behavior_hint="")] = None,
     option: Options = (),
     part: Literal["train", "all"] = "train",
     validation: Annotated[Path | None, arg(metavar="DIR", help_behavior_hint="")] = None,
+    decisions: Annotated[Path | None, arg(metavar="FILE", help_behavior_hint="")] = None,
+    tracker: TrackerName | None = None,
     device: Annotated[str | None, arg(metavar="DEVICE", help_behavior_hint="")] = None,
     preparation: Annotated[Preparation, arg(name="")] = PREPARATION,
 ) -> int:
@@ -43,7 +46,8 @@ def train_warpnet(
     $ wiw run imagenav --world-model warpnet --world-model-option weights=warpnet.safetensors
 
     Walks through the scenes are rendered and cached first, so that an interrupted command does not render them again.
-    Training takes 15 to 30 minutes on two idle cores. FILE also holds the recipe, and PSNR and SSIM on the val scenes,
+    Training takes 15 to 30 minutes on two idle cores, and resumes when the command is repeated; finished weights are
+    never replaced. FILE also holds the recipe, and PSNR and SSIM on the val scenes,
     next to copy and warp. The weights shipped with wiw were trained by this command with its defaults.
 
     With --data, it trains on the clips of a dataset instead, in the order that post-training uses: validated on scenes
@@ -56,10 +60,14 @@ def train_warpnet(
         val: Held-out scenes for evaluation; none may be trained on.
         places: Walks recorded per scene. Default: 24.
         epochs: Number of epochs: how often each sample is used, on average. Default: 6. With --data: 3.
+        recipe: With --data: YAML file that overrides values of the built-in recipe.
         option: With --data: override a value of its recipe, such as clips=1600 or batch=8; may be repeated. See
             `wiw.training.warpnet_clips.WarpNetClipRecipe`.
         part: With --data: the part to train on; train holds out one in twenty scenes for validation.
         validation: With --data: another dataset, with other scenes, for validation. Default: the scenes held out.
+        decisions: With --data: file of `wiw collect decisions`, with which validation also measures how well the
+            model's ranking of the plans agrees with the true one.
+        tracker: With --data: experiment tracker that plots loss and validation; requires its package.
         device: With --data: where to train: cpu, cuda, cuda:1, ... Default: the GPU if there is one.
         limits: Time limit and seed.
         preparation: How training data is prepared.
@@ -68,20 +76,26 @@ def train_warpnet(
 
     check_counts(places=places, epochs=epochs)
     WarpNet.requires.require()
-    watched = {"part": part, "validation": validation, "device": device}
-    _check_source(data, scenes, places, limits, option, watched, preparation)
+    watched = {
+        "part": part,
+        "validation": validation,
+        "decisions": decisions,
+        "tracker": tracker,
+        "device": device,
+    }
+    _check_source(data, scenes, places, limits, recipe, option, watched, preparation)
     with write_weights("warpnet", out):
         if data is not None:
-            _train_on_data(out, data, val, epochs, limits.seed, option, watched, preparation)
+            _train_on_data(out, data, val, epochs, limits.seed, recipe, option, watched, preparation)
             return 0
         from wiw.training import warpnet as training
         from wiw.training.walks import WalkRules
 
         rules = WalkRules(**drop_none({"places": places}))
-        recipe = training.Recipe(**drop_none({"epochs": epochs, "seed": limits.seed}))
+        numbers = training.Recipe(**drop_none({"epochs": epochs, "seed": limits.seed}))
         with TrainingProgress() as progress:
             card = training.make_weights(
-                out, scenes, val, rules, recipe, limits.minutes, preparation, progress, track_items
+                out, scenes, val, rules, numbers, limits.minutes, preparation, progress, track_items
             )
         print(f"{card['ways']} walks, {card['recipe']['epochs']} epochs")
         _report(card["held_out"])
@@ -93,6 +107,7 @@ def _check_source(
     scenes: str,
     places: int | None,
     limits: Limits,
+    recipe: Path | None,
     option: Sequence[str],
     watched: Mapping[str, Any],
     preparation: Preparation,
@@ -100,10 +115,10 @@ def _check_source(
     """Refuse options that what is trained on does not have."""
     if data is None:
         found = {
+            "--recipe": recipe is not None,
             "--option": bool(option),
             "--part": watched["part"] != "train",
-            "--validation": watched["validation"] is not None,
-            "--device": watched["device"] is not None,
+            **{f"--{name}": watched[name] is not None for name in ("validation", "decisions", "tracker", "device")},
         }
         source = "walks; they go with --data"
     else:
@@ -124,6 +139,7 @@ def _train_on_data(
     val: str,
     epochs: int | None,
     seed: int,
+    recipe: Path | None,
     option: Sequence[str],
     watched: Mapping[str, Any],
     preparation: Preparation,
@@ -133,11 +149,11 @@ def _train_on_data(
     from wiw.training.warpnet import evaluate
     from wiw.training.warpnet_clips import WarpNetClipRecipe
 
-    numbers = drop_none({"epochs": epochs, "seed": seed})
+    numbers = drop_none({"epochs": epochs, "seed": seed or None})  # 0, the default, leaves that of the recipe's file
     options = {**numbers, **parse_options(option, WarpNetClipRecipe, "--option")}
-    recipe = load_recipe("warpnet", options=options, kind=WarpNetClipRecipe)
-    card = train_and_measure("warpnet", out, data, preparation.folder, val, recipe, watched, evaluate)
-    print(describe_steps(card, recipe.batch))
+    chosen = load_recipe("warpnet", recipe, options, kind=WarpNetClipRecipe)
+    card = train_and_measure("warpnet", out, data, preparation.folder, val, chosen, watched, evaluate)
+    print(describe_steps(card, chosen.batch))
     _report(card["held_out"])
     print(f"log       {out}.log")
 

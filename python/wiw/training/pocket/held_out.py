@@ -7,6 +7,7 @@ by the same traversals, and are never written.
 
 from __future__ import annotations
 
+from collections import defaultdict
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
@@ -20,6 +21,7 @@ from wiw._core import core
 from wiw.datasets.cameras import camera_pose
 from wiw.datasets.worlds import World, world
 from wiw.errors import ArgumentError
+from wiw.training.held_out_clips import APART
 from wiw.training.navigation_rules import NavigationRules
 from wiw.training.pocket.batches import compute_displacements
 from wiw.training.reduced_frames import Bar
@@ -105,22 +107,35 @@ def measure(
 ) -> Iterator[dict[str, Any]]:
     """Yield the PSNR in dB of each model's frames, weighted by latitude, in full size and reduced to size `small`.
 
-    The control gap is measured on mixed windows, with the places of each replaced by those of another, turns kept: rows
-    whose "control" is "shuffled". Turns are rolls, which say nothing about what a model has learnt.
+    The control gap is measured on mixed windows, with the places of each replaced by those of another one of its scene,
+    turns kept: rows whose "control" is "shuffled". Turns are rolls, which say nothing about what a model has learnt;
+    places that happen to be the same say nothing about whether it obeys, and have no such rows (`APART`).
+
+    Each scene is measured by itself, so that a row does not depend on what other scenes there are.
 
     Raises:
         ArgumentError: there are no windows.
     """
     if not windows:
         raise ArgumentError("expected scenes from which windows can be sampled, got none; choose others")
+    for scene in dict.fromkeys(window.scene for window in windows):
+        yield from _measure_scene([window for window in windows if window.scene == scene], models, seed, small)
+
+
+def _measure_scene(
+    windows: Sequence[Window], models: Mapping[str, Imagine], seed: int, small: tuple[int, int]
+) -> Iterator[dict[str, Any]]:
     others = shuffle_places(windows, seed)
     for index, window in enumerate(windows):
+        apart = np.linalg.norm(window.trajectory[:, :2] - others[index][:, :2], axis=1) > APART
         trajectories = {"true": window.trajectory}
-        trajectories |= {"shuffled": others[index]} if window.kind == "mixed" else {}
+        trajectories |= {"shuffled": others[index]} if apart.any() else {}
         for name, imagine in models.items():
             for control, trajectory in trajectories.items():
                 frames = imagine(window, trajectory, seed + index)
                 for step, truth in window.truth.items():
+                    if control == "shuffled" and not apart[step - 1]:
+                        continue
                     made = frames[step - 1]
                     yield {
                         "scene": window.scene,
@@ -170,9 +185,28 @@ def _summarise(rows: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
         return {str(step): round(float(np.mean(values)), 3) for step, values in found.items() if values}
 
     psnr = {model: average(model, "true") for model in dict.fromkeys(row["model"] for row in rows)}
-    shuffled = average("pocket", "shuffled")
-    gap = {step: round(psnr["pocket"][step] - value, 3) for step, value in shuffled.items()}
-    return {"windows": len({row["window"] for row in rows}), "psnr": psnr, "gap": gap}
+    lost = defaultdict[int, list[float]](list)
+    for (_, _, step), pair in pair_controls(rows, "pocket", "psnr").items():
+        lost[step].append(pair["true"] - pair["shuffled"])
+    gap = {str(step): round(float(np.mean(lost[step])), 3) for step in STEPS if lost[step]}
+    return {"windows": len({(row["scene"], row["window"]) for row in rows}), "psnr": psnr, "gap": gap}
+
+
+def pair_controls(
+    rows: Sequence[Mapping[str, Any]], model: str, size: str
+) -> dict[tuple[str, int, int], dict[str, float]]:
+    """Return a model's PSNR of frames that were imagined under both controls, by scene, window and step.
+
+    Args:
+        rows: of `measure`.
+        model: its name.
+        size: "psnr" or "psnr_small".
+    """
+    found = defaultdict[tuple[str, int, int], dict[str, float]](dict)
+    for row in rows:
+        if row["model"] == model:
+            found[row["scene"], row["window"], row["step"]][row["control"]] = row[size]
+    return {place: pair for place, pair in found.items() if len(pair) == 2}
 
 
 def imagine_by(model: Pocket) -> Imagine:
@@ -205,7 +239,7 @@ BASELINES: Mapping[str, Imagine] = {"copy": _copy, "rolled": _roll, "one room": 
 
 
 def shuffle_places(windows: Sequence[Window], seed: int) -> list[NDArray[np.float64]]:
-    """Return each window's trajectory with its own turns and the places of another mixed window."""
+    """Return each window's trajectory with its own turns and, for mixed ones, the places of another mixed window."""
     found = [window.trajectory.copy() for window in windows]
     order = np.random.default_rng(seed).permutation([i for i, each in enumerate(windows) if each.kind == "mixed"])
     for index, other in zip(order, np.roll(order, 1), strict=True):

@@ -4,7 +4,6 @@
 from __future__ import annotations
 
 import json
-import shutil
 from collections.abc import Callable, Mapping
 from collections.abc import Set as AbstractSet
 from dataclasses import dataclass
@@ -275,30 +274,23 @@ class ValidatedTrainer(ResumableTrainer):
         return self.trainer.state_dict()
 
     def load_state_dict(self, state: Mapping[str, Any]) -> None:
-        """Resume from a state that `state_dict` returned; what was logged or found best after it is forgotten.
+        """Resume from a state that `state_dict` returned; what was logged after it is forgotten.
+
+        Weights that were best at a later step stay so until better ones are found: those of an earlier step, which they
+        have replaced, would not be found again.
 
         Raises:
             FileError: the log cannot be read or written.
         """
         self.trainer.load_state_dict(state)
-        lines = distributed.call_on_main(self._rewind)
+        lines = distributed.call_on_main(lambda: self._log.rewind(self.step_count))
         self._validated = {line["step"] for line in lines if f"{PREFIX}{CRITERION}" in line}
 
-    def _rewind(self) -> list[dict[str, Any]]:
-        """Rewind the log to the present step, and remove best weights of a later one; return the lines that stay."""
-        lines = self._log.rewind(self.step_count)
-        if self._read_card().get("steps", 0) > self.step_count:
-            shutil.rmtree(self.best, ignore_errors=True)
-        return lines
-
     def _read_best(self) -> float:
-        card = self._read_card()
-        return float(card["validation"][CRITERION]) if card else -np.inf
-
-    def _read_card(self) -> dict[str, Any]:
-        """Return what is known about the best weights; empty if there are none."""
         card = self.best / CARD
-        return dict(json.loads(card.read_text(encoding="utf-8"))) if card.exists() else {}
+        if not card.exists():
+            return -np.inf
+        return float(json.loads(card.read_text(encoding="utf-8"))["validation"][CRITERION])
 
 
 def draw_sheet(clips: HeldOutClips[Any], own: Frames, other: Frames) -> NDArray[np.uint8]:
