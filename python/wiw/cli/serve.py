@@ -4,6 +4,7 @@
 from __future__ import annotations
 
 import asyncio
+import os
 import signal
 import sys
 import time
@@ -18,6 +19,8 @@ from wiw.wire.address_book import ServerAddress, announce_server, find_token, na
 
 SHOWN, LOGGED = 1.0, 10.0
 """Seconds between status lines, on a terminal and elsewhere."""
+WATCH = 1.0
+"""Seconds between two looks whether the model hangs."""
 
 
 def serve(
@@ -35,6 +38,7 @@ def serve(
     grace: Annotated[float, arg(metavar="SECONDS")] = 30.0,
     announce: Annotated[Path | None, arg(metavar="FILE")] = None,
     idle: Annotated[float | None, arg(metavar="SECONDS")] = None,
+    stall: Annotated[float | None, arg(metavar="SECONDS")] = None,
 ) -> int:
     """Serve a world model to runs in other processes or on other machines.
 
@@ -67,21 +71,27 @@ def serve(
         announce: File (.json) that announces address and token while the server is up; clients are given its folder.
             Only its owner can read it. Without --token a random one is used.
         idle: Seconds without any client after which the server exits. Default: never.
+        stall: Seconds that the model may take for one call. After that it counts as hung, and the server exits with
+            code 2, so that what started it can start it again; `inf` never does. Default: four times the longest
+            deadline of a client, and at least 1200.
     """
     from wiw.registry import WORLD_MODELS
     from wiw.runs.part_options import parse_options
     from wiw.serving.server import Server, Settings
+    from wiw.serving.watchdog import Watchdog
 
     secret = find_token(token, announce)
     settings = Settings(host, port, secret, queue, window, certificate, key, grace)
     options = parse_options(world_model_option, WORLD_MODELS.find_here(model), "--world-model-option")
     server = Server(WORLD_MODELS.make_here(model, **options), settings)  # here: this process holds no simulator
-    asyncio.run(_live(server, model, announce, idle))
+    asyncio.run(_live(server, model, announce, idle, Watchdog(server, stall)))
     return 0
 
 
-async def _live(server: Any, name: str, announce: Path | None, idle: float | None) -> None:
-    """Serve until a signal arrives or the server has been idle for too long; announce it and print status lines."""
+async def _live(server: Any, name: str, announce: Path | None, idle: float | None, watchdog: Any) -> None:
+    """Serve until a signal arrives, the server has been idle for too long, or its model hangs; announce it and print
+    status lines.
+    """
     loop, signals = asyncio.get_running_loop(), 0
     ready = asyncio.Event()
     announcing = ExitStack()
@@ -108,6 +118,7 @@ async def _live(server: Any, name: str, announce: Path | None, idle: float | Non
         loop.add_signal_handler(number, stop)
     beside = [asyncio.ensure_future(_show(server, name, ready))]
     beside += [] if idle is None else [asyncio.ensure_future(_end_if_idle(server, idle, ready))]
+    beside += [asyncio.ensure_future(_end_if_hung(watchdog, announcing))]
     try:
         await serving
     except asyncio.CancelledError:
@@ -127,6 +138,15 @@ async def _end_if_idle(server: Any, seconds: float, ready: asyncio.Event) -> Non
         await asyncio.sleep(min(1.0, seconds / 4))
         last = time.monotonic() if server.clients else last
     server.end()
+
+
+async def _end_if_hung(watchdog: Any, announcing: ExitStack) -> None:
+    """End the process once its model hangs; a shutdown in order would wait for the model."""
+    while not (cause := watchdog.find_hang()):
+        await asyncio.sleep(WATCH)
+    announcing.close()
+    print(f"\nwiw serve: {cause}", file=sys.stderr, flush=True)
+    os._exit(2)
 
 
 async def _show(server: Any, name: str, ready: asyncio.Event) -> None:

@@ -3,7 +3,8 @@
 
 An actor gets its GPUs of Ray and starts the command as a separate process, which ends with the actor; a server that
 crashes takes nothing else with it. A server comes back at its address where its node is still there, and clients repeat
-what it has not answered; at another address the run's workers are told the new one.
+what it has not answered; at another address the run's workers are told the new one. A server whose model hangs ends
+itself (`wiw.serving.watchdog`).
 """
 
 from __future__ import annotations

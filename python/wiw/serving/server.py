@@ -145,6 +145,8 @@ class Server:
         self.worker = Worker(model, self.queue, self._report)
         self.refused = 0
         """Number of messages and connections that violated the protocol."""
+        self.longest_wait = 0.0
+        """Most seconds that a client has said it waits for a row."""
         self._welcome = _welcome(model, AHEAD * batch)
         self._jobs: dict[bytes, Job] = {}
         self._recent_answers = AnswerCache(KNOWN_BYTES)
@@ -298,6 +300,7 @@ class Server:
         """Queue a row, unless it is queued or computed already; False where the queue is full."""
         job = self._jobs.get(ask.id)
         now = time.monotonic()
+        self.longest_wait = max(self.longest_wait, ask.seconds)
         if job is None:
             try:
                 row = unpack_row(ask.row)

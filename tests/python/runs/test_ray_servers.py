@@ -11,6 +11,7 @@ import threading
 import time
 from collections.abc import Sequence
 from contextlib import suppress
+from dataclasses import replace
 from pathlib import Path
 from types import SimpleNamespace
 
@@ -23,7 +24,7 @@ from run_facts import list_facts
 import wiw
 from wiw.cli import main
 from wiw.errors import ArgumentError, InfrastructureError
-from wiw.runs import ray_servers
+from wiw.runs import ray_engine, ray_servers
 from wiw.runs.config import EngineConfig
 from wiw.runs.part_options import parse_options
 from wiw.runs.recipes import AgentRecipe, TaskRecipe
@@ -247,6 +248,44 @@ def test_a_server_that_dies_at_every_question_ends_the_run_after_three_tries(ray
     marker.unlink()
     log = resume_run(out, progress=False, retry_errors=True, engine={"engine": "processes"})
     assert [row["status"] for row in log.episodes] == ["done"] * 6
+
+
+HANGING = """
+import time
+from pathlib import Path
+import wiw
+
+class Hanging(wiw.WorldModel):
+    accepts = wiw.accepts("trajectory", view="perspective", size=(48, 48), frames=6, best_batch=4)
+
+    def rollout(self, observations, controls, seeds):
+        if not Path({marker!r}).exists():
+            Path({marker!r}).touch()
+            time.sleep(3600)
+        return observations.image[:, None].repeat(6, 1)
+"""
+
+
+@pytest.mark.nightly
+def test_a_server_whose_model_hangs_is_started_again(ray, tmp_path, monkeypatch):
+    """The first call never returns, though the server answers pings: it ends itself, and the run goes on."""
+    (tmp_path / "hanging.py").write_text(HANGING.format(marker=str(tmp_path / "hung")))
+    causes, restart = [], ray_servers.ServerPool._restart
+
+    def write(*given):
+        return [replace(each, arguments=(*each.arguments, "--stall", "2")) for each in write_commands(*given)]
+
+    def note(pool, server, cause, is_gone=False):
+        causes.append(cause)
+        restart(pool, server, cause, is_gone)
+
+    monkeypatch.setattr(ray_engine, "write_commands", write)
+    monkeypatch.setattr(ray_servers.ServerPool, "_restart", note)
+    agent = AgentRecipe(WALKER, f"{tmp_path}/hanging.py:Hanging", candidates=2, horizon=5, execute=3)
+    settings = {"engine": "ray", "servers": 1, "server_gpus": 0, "live": 2, "cache": "off", "progress": False}
+    log = evaluate(TaskRecipe(TASK), agent, 4, out=tmp_path / "run", **settings)
+    assert [row["status"] for row in log.episodes] == ["done"] * 4
+    assert len(causes) == 1 and "exit code 2" in causes[0] and "Hanging has not returned from a call" in causes[0]
 
 
 def test_a_server_that_cannot_start_is_said_with_its_output(ray, tmp_path):

@@ -4,10 +4,12 @@
 from __future__ import annotations
 
 import contextlib
+import itertools
+import os
 import socket
 import threading
 import time
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
 
@@ -16,10 +18,12 @@ import pytest
 
 import wiw
 from wiw.errors import ArgumentError, ContractError, RemoteError
+from wiw.loop.attempts import Attempted
 from wiw.runs.arm_text import split_arms
 from wiw.runs.recipes import AgentRecipe
 from wiw.serving.background import serve_in_background
 from wiw.types import Conditioning, Control
+from wiw.wire.address_book import ServerAddress, announce_server
 from wiw.world_models.base import answer_deadline
 from wiw.world_models.remote import links
 from wiw.world_models.remote.model import Remote
@@ -43,6 +47,9 @@ class Counting(wiw.WorldModel):
         frames = np.repeat(observations.image[:, None], len(controls[0].actions) + 1, 1)
         frames[:, 1:] += (seeds % np.uint64(97)).astype(np.uint8)[:, None, None, None, None]
         return frames
+
+    def describe(self) -> dict[str, Any]:
+        return {"name": "Counting"}
 
     def fingerprint(self) -> str:
         return self.name
@@ -156,6 +163,137 @@ def test_a_server_that_dies_at_its_work_loses_nothing(monkeypatch: pytest.Monkey
         assert time.monotonic() - began < 5, "the one that is gone is not waited for"
         client.close()
         gate.set()
+
+
+def wait_for(condition: Callable[[], bool], seconds: float = 20.0) -> None:
+    end = time.monotonic() + seconds
+    while not condition():
+        assert time.monotonic() < end, "it did not happen"
+        time.sleep(0.01)
+
+
+def make_other_rows(count: int, start: int) -> tuple[Conditioning, list[Control], Any]:
+    image, controls, seeds = make_rows(count)
+    return image, controls, seeds + np.uint64(start)
+
+
+def ask_within(client: wiw.WorldModel, seconds: float, given: tuple[Conditioning, list[Control], Any]) -> float:
+    """Ask for rows, check their frames, and return how long that took."""
+    began = time.monotonic()
+    with answer_deadline(seconds):
+        frames = client.rollout(*given)
+    np.testing.assert_array_equal(frames, Counting().rollout(*given))
+    return time.monotonic() - began
+
+
+def test_rows_of_a_server_that_hangs_go_to_the_other_and_it_comes_back_once_it_has_answered() -> None:
+    """Its connection stays, as that of a server whose model is stuck in a GPU call."""
+    gate = threading.Event()
+    well, hanging = Counting(), Counting(gate=gate)
+    with serve(hanging, well) as (client, servers):
+        assert 1.5 < ask_within(client, 4.0, make_rows(12)) < 3.8
+        assert servers[0].clients == 1 and hanging.begun.is_set() and (hanging.rows, well.rows) == (0, 12)
+        assert ask_within(client, 60.0, make_other_rows(12, 100)) < 5, "it is passed over from now on"
+        assert (hanging.rows, well.rows) == (0, 24)
+        gate.set()
+        wait_for(lambda: hanging.rows >= 4 and not servers[0].pending_rows)
+        before = hanging.rows
+        ask_within(client, 60.0, make_other_rows(12, 200))
+        assert hanging.rows >= before + 4, "it has its share again"
+
+
+def test_a_server_that_hung_over_rows_of_others_comes_back_too(monkeypatch: pytest.MonkeyPatch) -> None:
+    """It answers nothing that this client has asked for, which it refuses as late; single rows show that it is back."""
+    monkeypatch.setattr(links, "PROBE", 0.1)
+    gate = threading.Event()
+    well, hanging = Counting(), Counting(gate=gate)
+    with serve(hanging, well) as (client, servers), contextlib.closing(Remote(servers[0].address)) as other:
+        asking = threading.Thread(target=lambda: other.rollout(*make_other_rows(4, 50)))
+        asking.start()
+        assert hanging.begun.wait(10)
+        ask_within(client, 1.5, make_rows(8))
+        wait_for(lambda: servers[0].pending_rows == 4)
+        gate.set()
+        asking.join(20)
+        assert hanging.rows == 4
+
+        starts = itertools.count(100, 10)
+
+        def has_share() -> bool:
+            before = hanging.rows
+            ask_within(client, 60.0, make_other_rows(8, next(starts)))
+            return hanging.rows >= before + 4
+
+        wait_for(has_share)
+
+
+def test_servers_that_are_all_slow_keep_their_rows() -> None:
+    gate = threading.Event()
+    models = [Counting(gate=gate), Counting(gate=gate)]
+    with serve(*models) as (client, _):
+        threading.Timer(3.0, gate.set).start()
+        assert ask_within(client, 4.5, make_rows(8)) >= 2.9, "later than half of the deadline"
+    assert [model.rows for model in models] == [4, 4]
+
+
+def test_a_call_that_no_server_answers_ends_at_its_deadline_and_the_next_one_asks_again() -> None:
+    gate = threading.Event()
+    models = [Counting(gate=gate), Counting(gate=gate)]
+    with serve(*models) as (client, _):
+        began = time.monotonic()
+        with answer_deadline(1.0), pytest.raises(RemoteError, match="8 of 8 rows were not answered in time") as caught:
+            client.rollout(*make_rows(8))
+        assert caught.value.kind == "deadline" and 0.8 < time.monotonic() - began < 5
+        threading.Timer(0.5, gate.set).start()
+        assert ask_within(client, 60.0, make_rows(8)) < 20
+    assert [model.rows for model in models] == [4, 4], "what they were computing was not computed again"
+
+
+def test_a_server_that_hangs_costs_no_try() -> None:
+    gate = threading.Event()
+    with serve(Counting(gate=gate), Counting()) as (client, _):
+        attempted, given = Attempted(client, 3.0, checks_pictures=False), make_rows(3)
+        np.testing.assert_array_equal(attempted.rollout(*given), Counting().rollout(*given))
+        assert not attempted.spent.get("retries")
+        gate.set()
+
+
+@contextlib.contextmanager
+def announce(folder: Path, *models: wiw.WorldModel) -> Iterator[list[Any]]:
+    """Serve models and announce them in a folder."""
+    with contextlib.ExitStack() as stack:
+        servers = [stack.enter_context(serve_in_background(model)) for model in models]
+        for place, server in enumerate(servers):
+            stack.enter_context(announce_server(ServerAddress(server.address), folder / f"{place}.json"))
+        yield servers
+
+
+def test_an_announced_server_that_hangs_is_left_for_the_next(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(os, "getpid", lambda: 0)  # begins with the first
+    gate = threading.Event()
+    hanging, well = Counting(gate=gate), Counting()
+    with announce(tmp_path, hanging, well) as servers, contextlib.closing(Remote(str(tmp_path))) as client:
+        attempted = Attempted(client, 1.5, checks_pictures=False)
+        for start, retries in ((0, 1), (100, 1)):
+            given = make_other_rows(6, start)
+            np.testing.assert_array_equal(attempted.rollout(*given), Counting().rollout(*given))
+            assert attempted.spent["retries"] == retries, "the second call asks the server that is well at once"
+        assert hanging.begun.is_set() and (hanging.rows, well.rows) == (0, 12)
+        assert (servers[0].clients, servers[1].clients) == (0, 1)
+        gate.set()
+
+
+def test_the_only_announced_server_is_not_left(tmp_path: Path) -> None:
+    gate = threading.Event()
+    model = Counting(gate=gate)
+    with announce(tmp_path, model) as servers, contextlib.closing(Remote(str(tmp_path))) as client:
+        for _ in range(2):
+            with answer_deadline(0.5), pytest.raises(RemoteError, match="busy or hung"):
+                client.rollout(*make_rows(4))
+        connections = set(servers[0]._unanswered)
+        threading.Timer(0.3, gate.set).start()
+        ask_within(client, 60.0, make_rows(4))
+        assert set(servers[0]._unanswered) == connections and model.rows == 4
 
 
 def test_another_model_is_refused_at_the_start() -> None:

@@ -9,7 +9,6 @@ from __future__ import annotations
 
 import asyncio
 import contextlib
-import math
 import os
 import random
 import threading
@@ -29,7 +28,7 @@ from websockets.exceptions import ConnectionClosed, InvalidStatus
 
 import wiw
 from wiw.errors import ContractError, RemoteError
-from wiw.wire.address_book import ServerAddress, choose_server
+from wiw.wire.address_book import ServerAddress, choose_server, read_addresses
 from wiw.wire.loopback import is_loopback
 from wiw.wire.messages import MOST_BYTES, Answer, Ask, Hello, Refusal, Wait, Welcome, decode, encode
 from wiw.wire.rows import row_id
@@ -39,16 +38,16 @@ FIRST_PAUSE, LONGEST_PAUSE = 0.1, 5.0
 HANDSHAKE = 10.0
 HEARTBEAT, SILENCE = 10.0, 30.0
 """Seconds between pings, and without an answer to one until the connection counts as lost."""
-GLANCE = 0.2
-"""Seconds between two looks at whether the connection is still there, for those who wait no longer than it is."""
 BREACHES = frozenset({"type", "dtype", "nan", "shape", "frames", "frame 0", "channels", "scale", "contract"})
 """Kinds of `ContractError`."""
+FROM_MODEL = BREACHES | {"raised"}
+"""Kinds of refusals that say that the model has returned; the others come from a server whose model hangs, too."""
 
 Frames = NDArray[np.uint8]
 
 
 @dataclass
-class _Question:
+class Question:
     """A row that waits for its answer."""
 
     id: bytes
@@ -60,7 +59,8 @@ class _Question:
 
 
 class Link:
-    """A connection to the server at an address, or to one of those announced in a folder, the next when it is lost.
+    """A connection to the server at an address, or to one of those announced in a folder: the next when it is lost, or
+    when a deadline has passed without any answer from it.
 
     Any number of threads may use it.
     """
@@ -69,15 +69,18 @@ class Link:
         self.address = address
         self._given = ServerAddress(address, token)
         self._turn = os.getpid()  # clients spread over the servers
-        self._open: dict[bytes, _Question] = {}
+        self._open: dict[bytes, Question] = {}
         self._welcome: Future[Welcome] = Future()
         self.last_error = "not connected yet"
         """Why the latest connection ended."""
         self._closed = False
         self._loop = asyncio.new_event_loop()
         self._wanted = asyncio.Event()
-        self._outbox: asyncio.Queue[_Question] | None = None
+        self._outbox: asyncio.Queue[Question] | None = None
         self._lost_at = time.monotonic()
+        self.alive_at = self._lost_at
+        """When the model last returned something, or the connection began, as `time.monotonic()` tells it."""
+        self._leaves = asyncio.Event()
         self._thread = threading.Thread(target=self._run, daemon=True, name="wiw remote")
         self._thread.start()
 
@@ -102,53 +105,60 @@ class Link:
         """Whether questions reach the server at present."""
         return self._outbox is not None
 
+    @property
+    def lost_seconds(self) -> float:
+        """Seconds without a connection; 0 if there is one."""
+        return 0.0 if self.is_connected else time.monotonic() - self._lost_at
+
     def wake(self) -> None:
         """Connect again where the connection was lost; nobody waits for it."""
         self._call_soon(self._wanted.set)
 
-    def ask(self, rows: Sequence[bytes], give_up: float, lost: float = math.inf) -> list[Frames]:
+    def ask(self, rows: Sequence[bytes], give_up: float) -> list[Frames]:
         """Return the frames of each row, in order.
 
         Args:
             rows: as `pack_row` packs them.
             give_up: when to wait no longer, as `time.monotonic()` tells it.
-            lost: seconds without a connection after which it waits no longer either.
 
         Raises:
             RemoteError: not all are there in time ("connection" if there is none), or the server refuses one.
             ContractError: the served model broke its contract.
         """
-        if self._closed:
-            raise self._build_closed_error()
-        questions = [_Question(row_id(row), row, give_up, len(rows) - place) for place, row in enumerate(rows, start=1)]
-        asked: Future[list[_Question]] = Future()
-        self._call_soon(lambda: asked.set_result([self._submit(question) for question in questions]))
+        asked_at, questions = time.monotonic(), self.submit(rows, give_up)
         try:
-            questions = asked.result(max(0.0, give_up - time.monotonic()))
-            return [self._await_answer(question, give_up, lost) for question in questions]
+            return [question.answer.result(max(0.0, give_up - time.monotonic())) for question in questions]
         except LateError:
-            raise self._build_deadline_error() from None
+            late = self._build_deadline_error()
+            self._call_soon(lambda: self._leave_silent(asked_at))
+            raise late from None
+        except RemoteError as error:
+            if error.kind == "deadline":  # the server has seen first that the time is over
+                self._call_soon(lambda: self._leave_silent(asked_at))
+            raise
         finally:
-            self._call_soon(lambda: self._drop_questions(questions))
+            self.drop(questions)
 
-    def _await_answer(self, question: _Question, give_up: float, lost: float) -> Frames:
-        """Return the answer to a question.
+    def submit(self, rows: Sequence[bytes], give_up: float) -> list[Question]:
+        """Ask for rows, as `ask` does, and return the questions without waiting for their answers.
 
         Raises:
-            LateError: it did not arrive in time.
-            RemoteError: the connection has been lost for too long.
+            RemoteError: the connection was closed on this side, or the time is over.
         """
-        while True:
-            left = give_up - time.monotonic()
-            try:
-                return question.answer.result(max(0.0, left if math.isinf(lost) else min(left, GLANCE)))
-            except LateError:
-                if left <= 0:
-                    raise
-                if not self.is_connected and time.monotonic() - self._lost_at >= lost:
-                    raise RemoteError(
-                        f"the connection to {self.address} was lost: {self.last_error}", "connection"
-                    ) from None
+        if self._closed:
+            raise self._build_closed_error()
+        questions = [Question(row_id(row), row, give_up, len(rows) - place) for place, row in enumerate(rows, start=1)]
+        asked: Future[list[Question]] = Future()
+        self._call_soon(lambda: asked.set_result([self._submit(question) for question in questions]))
+        try:
+            return asked.result(max(0.0, give_up - time.monotonic()))
+        except LateError:
+            self.drop(questions)
+            raise self._build_deadline_error() from None
+
+    def drop(self, questions: Sequence[Question]) -> None:
+        """Drop questions that the caller waits for no more."""
+        self._call_soon(lambda: self._drop_questions(questions))
 
     def close(self) -> None:
         """End the connection and the thread, and fail the calls that still wait."""
@@ -193,6 +203,8 @@ class Link:
                     await self._shake_hands(connection)
                     pause = FIRST_PAUSE
                     await self._exchange_messages(connection)
+                self._turn += 1
+                continue
             except RemoteError as error:
                 self._fail_all(error)
             except InvalidStatus as error:
@@ -253,16 +265,22 @@ class Link:
             )
 
     async def _exchange_messages(self, connection: ClientConnection) -> None:
-        """Send questions and receive answers until the connection ends."""
-        outbox: asyncio.Queue[_Question] = asyncio.Queue()
+        """Send questions and receive answers until the server is to be left.
+
+        Raises:
+            ConnectionError: the connection has ended; and whatever else ends it.
+        """
+        outbox: asyncio.Queue[Question] = asyncio.Queue()
         room = asyncio.Semaphore(self._welcome.result().in_flight)
         asked: set[bytes] = set()
         again = [question for question in self._open.values() if not question.answer.done()]
         for place, question in enumerate(again, start=1):
             question.rest = len(again) - place
             outbox.put_nowait(question)
-        self._outbox = outbox
+        self._outbox, self.alive_at = outbox, time.monotonic()
+        self._leaves.clear()
         tasks = [
+            asyncio.ensure_future(self._leaves.wait()),
             asyncio.ensure_future(self._send_questions(connection, outbox, room, asked)),
             asyncio.ensure_future(self._receive_answers(connection, outbox, room, asked)),
         ]
@@ -279,7 +297,7 @@ class Link:
     async def _send_questions(
         self,
         connection: ClientConnection,
-        outbox: asyncio.Queue[_Question],
+        outbox: asyncio.Queue[Question],
         room: asyncio.Semaphore,
         asked: set[bytes],
     ) -> None:
@@ -297,7 +315,7 @@ class Link:
     async def _receive_answers(
         self,
         connection: ClientConnection,
-        outbox: asyncio.Queue[_Question],
+        outbox: asyncio.Queue[Question],
         room: asyncio.Semaphore,
         asked: set[bytes],
     ) -> None:
@@ -312,6 +330,8 @@ class Link:
                 raise RemoteError(f"{self.address}: unexpected {type(message).__name__}", "message")
             room.release()
             asked.discard(message.id)
+            if isinstance(message, Answer) or (isinstance(message, Refusal) and message.kind in FROM_MODEL):
+                self.alive_at = time.monotonic()
             question = self._open.get(message.id)
             if question is None or question.answer.done():
                 continue
@@ -325,7 +345,17 @@ class Link:
             else:
                 question.answer.set_exception(_error(message))
 
-    def _submit(self, question: _Question) -> _Question:
+    def _leave_silent(self, asked_at: float) -> None:
+        """Leave a server that has answered nothing since a question was asked, if another one is announced.
+
+        The next one then gets the open questions.
+        """
+        is_silent = self.is_connected and self.alive_at <= asked_at
+        if is_silent and self._is_announced and len(read_addresses(Path(self._given.address))) > 1:
+            self.last_error = f"{self.address} was left: it did not answer in time"
+            self._leaves.set()
+
+    def _submit(self, question: Question) -> Question:
         """Open a question, or return the same one that is open already."""
         same = self._open.get(question.id)
         if same is not None and not same.answer.done():
@@ -338,7 +368,7 @@ class Link:
         self._wanted.set()
         return question
 
-    def _drop_questions(self, questions: Sequence[_Question]) -> None:
+    def _drop_questions(self, questions: Sequence[Question]) -> None:
         """Drop questions that nobody waits for any more."""
         for question in questions:
             question.askers -= 1
