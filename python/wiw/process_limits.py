@@ -9,11 +9,13 @@ import os
 import resource
 import signal
 import sys
+from collections.abc import Iterator
 from contextlib import suppress
 from pathlib import Path
 
 _PR_SET_PDEATHSIG = 1
-_CGROUPS = ("/sys/fs/cgroup/memory.max", "/sys/fs/cgroup/memory/memory.limit_in_bytes")
+_ROOT = Path("/")
+"""Root folder of the system's files."""
 
 
 def make_child_environment() -> dict[str, str]:
@@ -42,16 +44,55 @@ def limit_time(seconds: float) -> None:
 
 
 def find_memory_limit() -> int:
-    """Return three quarters of the machine's or the container's memory in bytes."""
+    """Return three quarters of the least of the memory in bytes of the machine, the container and the batch job."""
     most = os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES")
-    for file in _CGROUPS:
-        with suppress(OSError, ValueError):  # "max": no limit
-            most = min(most, int(Path(file).read_text()))
+    for file in _list_limit_files():
+        with suppress(OSError, ValueError):  # no limit: the file is absent, or says "max"
+            most = min(most, int(file.read_text()))
     return most * 3 // 4
 
 
+def _list_limit_files() -> Iterator[Path]:
+    """Yield the files that may limit this process's memory: of its control groups and of all above them.
+
+    A batch system limits a group far below the root, whose own files say nothing of that; see cgroups(7).
+    """
+    groups = {kind: path for line in _read_lines("proc/self/cgroup") for kind, path in [_parse_group(line)]}
+    mounts = list(_list_hierarchies()) or [("cgroup2", "/", "/sys/fs/cgroup"), ("cgroup", "/", "/sys/fs/cgroup/memory")]
+    for kind, root, mount in mounts:
+        place, own = _ROOT / mount.lstrip("/"), Path(groups.get(kind, "/"))
+        below = own.relative_to(root) if own.is_relative_to(root) and ".." not in own.parts else Path()
+        name = "memory.max" if kind == "cgroup2" else "memory.limit_in_bytes"
+        yield from (place / folder / name for folder in (below, *below.parents))
+
+
+def _parse_group(line: str) -> tuple[str, str]:
+    """Return the kind of hierarchy that a line of /proc/self/cgroup is of, "" if not of memory, and the group in it."""
+    number, controllers, path = (*line.split(":", 2), "", "")[:3]
+    if number == "0" and not controllers:
+        return "cgroup2", path
+    return "cgroup" if "memory" in controllers.split(",") else "", path
+
+
+def _list_hierarchies() -> Iterator[tuple[str, str, str]]:
+    """Yield kind, group at its root, and folder of the mounted hierarchies of groups that may limit memory."""
+    for line in _read_lines("proc/self/mountinfo"):
+        before, _, after = line.partition(" - ")
+        kind, options = after.partition(" ")[0], after.rpartition(" ")[2]
+        if kind == "cgroup2" or (kind == "cgroup" and "memory" in options.split(",")):
+            root, mount = before.split()[3:5]
+            yield kind, root, mount
+
+
+def _read_lines(name: str) -> list[str]:
+    """Return the lines of one of the system's files; none where it cannot be read."""
+    with suppress(OSError):
+        return (_ROOT / name).read_text().splitlines()
+    return []
+
+
 def limit_memory() -> int:
-    """Let this process take three quarters of the machine's or the container's memory; return that in bytes.
+    """Let this process take what `find_memory_limit` returns; return that in bytes.
 
     The kernel counts each process separately: each one that this process starts may take as much again.
     """

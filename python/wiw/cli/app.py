@@ -69,8 +69,8 @@ on a task, for one world model or several on the same episodes, and measures how
 `wiw COMMAND --help` explains each command with examples. `--debug` shows the full traceback of an error.
 
 Exit codes: 0 success, 1 the run is invalid (verify: something differs; judge: marks are missing), 2 error, 130 stopped
-by Ctrl-C, 75 stopped within 6 seconds by SIGTERM or SIGUSR2. A stopped run keeps everything recorded so far; `wiw
-resume` continues it."""
+by Ctrl-C, 75 stopped by SIGTERM or SIGUSR2 (within 6 seconds; with --scratch within 60). A stopped run keeps everything
+recorded so far; `wiw resume` continues it."""
 
 COMMANDS: tuple[tuple[Callable[..., int], str, str], ...] = (
     (demo, "demo", "See it work: several world models on a few episodes of each task, with tables and reports."),

@@ -58,8 +58,8 @@ def run(
     $ wiw run imagenav --arms none,warp --episodes 400 --salt 7f3a --shard 3/8 --out runs/a/3 --resume
     $ wiw run imagenav --policy isolated:my_policy.py:MyPolicy --world-model my_model.py:MyModel
 
-    Ctrl-C (exit code 130) or SIGTERM (75, within 6 seconds) stops a run without losing anything recorded; `wiw resume`
-    continues it.
+    Ctrl-C (exit code 130) or SIGTERM (75, within 6 seconds; with --scratch within 60, in which the store is copied)
+    stops a run without losing anything recorded; `wiw resume` continues it.
 
     Args:
         task: Name of the task; see `wiw list`.

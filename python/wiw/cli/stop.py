@@ -1,9 +1,13 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Handle SIGTERM and SIGUSR2: close the run within seconds, whatever it is doing, with an exit code for "resume me"."""
+"""Handle SIGTERM and SIGUSR2: close the run within seconds, whatever it is doing, with an exit code for "resume me".
+
+Only a store that is written on a local disk gets longer, as it is copied to its own folder.
+"""
 
 from __future__ import annotations
 
 import atexit
+import math
 import multiprocessing
 import os
 import signal
@@ -15,6 +19,8 @@ from pathlib import Path
 from types import FrameType
 from typing import Any, NoReturn
 
+from wiw.errors import ArgumentError, Error
+from wiw.runs.scratch import STOP_VARIABLE, copy_unclosed, has_unclosed
 from wiw.training.launcher import count_started
 
 EXIT_RESUME = 75
@@ -23,6 +29,11 @@ STOPPING = (signal.SIGTERM, signal.SIGUSR2)
 """SIGUSR2 is what SLURM sends to all processes of submitit's jobs before their time is up."""
 GRACE = 4.0
 """Seconds for an orderly shutdown; then the process exits, which loses nothing, as every record is already on disk."""
+STOP_SECONDS = 60.0
+"""Seconds after which the process exits even if a store is still being copied, whose last whole copy then remains;
+$WIW_STOP_SECONDS is another number, for a batch system that gives a job less or more."""
+LAST = 1.0
+"""Seconds to end in once the store is copied."""
 
 
 class Terminated(BaseException):
@@ -51,12 +62,16 @@ def raise_on_stop_signals() -> Iterator[None]:
     """Raise `Terminated` at the first of `STOPPING`; end the process if the work does not react, as inside a model.
 
     Python runs signal handlers only between its own instructions, so a thread, notified through a pipe, enforces the
-    end.
+    end. Where the work does not react within `GRACE`, it also copies stores from a local disk to their own folders.
+
+    Raises:
+        ArgumentError: $WIW_STOP_SECONDS is no number of seconds.
     """
+    seconds = _read_stop_seconds()
     watch, tell = os.pipe()
     os.set_blocking(tell, False)
     done = threading.Event()
-    guard = threading.Thread(target=_guard, args=(watch, done), daemon=True)
+    guard = threading.Thread(target=_guard, args=(watch, done, seconds), daemon=True)
     handlers = {number: signal.signal(number, _terminate) for number in STOPPING}
     earlier = signal.set_wakeup_fd(tell, warn_on_full_buffer=False)
     guard.start()
@@ -82,9 +97,20 @@ def _note(number: int, frame: FrameType | None) -> None:
     """Do nothing. Python complains about a signal that arrives and is then ignored with `SIG_IGN`."""
 
 
-def _guard(watch: int, done: threading.Event) -> None:
+def _read_stop_seconds() -> float:
+    text = os.environ.get(STOP_VARIABLE, "")
+    try:
+        seconds = float(text or STOP_SECONDS)
+    except ValueError:
+        seconds = math.nan
+    if not 0 <= seconds < math.inf:
+        raise ArgumentError(f"{STOP_VARIABLE}={text}: expected a number of seconds, such as 60: change or unset it")
+    return seconds
+
+
+def _guard(watch: int, done: threading.Event, seconds: float) -> None:
     while number := os.read(watch, 1):
-        if number[0] in STOPPING and not done.wait(GRACE):
+        if number[0] in STOPPING and not done.wait(GRACE) and not _wait_for_copies(done, seconds - GRACE):
             for worker in multiprocessing.active_children():
                 worker.kill()
             print(
@@ -94,6 +120,23 @@ def _guard(watch: int, done: threading.Event) -> None:
             )
             sys.stderr.flush()
             os._exit(EXIT_RESUME)
+
+
+def _wait_for_copies(done: threading.Event, seconds: float) -> bool:
+    """Have stores copied from a local disk in at most some seconds; return whether the work has ended meanwhile."""
+    if not has_unclosed():
+        return False
+    copying = threading.Thread(target=_copy_stores, daemon=True)
+    copying.start()
+    copying.join(max(0.0, seconds))
+    return done.wait(LAST)
+
+
+def _copy_stores() -> None:
+    try:
+        copy_unclosed()
+    except Error as error:
+        print(f"wiw: {error}", file=sys.stderr, flush=True)
 
 
 def stoppable(work: Callable[[], Any], folder: Path, command: str = "resume") -> Any:

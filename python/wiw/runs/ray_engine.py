@@ -13,6 +13,7 @@ from __future__ import annotations
 import os
 import queue
 import secrets
+import sys
 import time
 from collections import deque
 from collections.abc import Iterable, Iterator, Mapping
@@ -60,9 +61,7 @@ class EpisodeActor:
     """A worker's side. One thread does all the work, for graphics contexts belong to the thread that made them."""
 
     def __init__(self, spec: bytes, threads: int) -> None:
-        import cv2
-
-        cv2.setNumThreads(threads)
+        limit_threads(threads)
         self._thread = ThreadPoolExecutor(1)
         self._runner = self._thread.submit(lambda: Runner(unpickle_spec(spec))).result()
 
@@ -94,6 +93,20 @@ class EpisodeActor:
             rows.put(None)
 
 
+def limit_threads(count: int) -> None:
+    """Let this process use a number of threads, or what its environment says: in the core, OpenCV and torch.
+
+    Call it before any of them computes: the core and torch read their variables when they start their threads.
+    """
+    import cv2
+
+    os.environ.setdefault("WIW_NUM_THREADS", str(count))
+    os.environ.setdefault("OMP_NUM_THREADS", str(count))
+    cv2.setNumThreads(int(os.environ["WIW_NUM_THREADS"]))
+    if "torch" in sys.modules:  # it may have read its variable
+        sys.modules["torch"].set_num_threads(int(os.environ["OMP_NUM_THREADS"]))
+
+
 @dataclass
 class _Lease:
     """A job and the actor that has it."""
@@ -116,11 +129,12 @@ def run_on_ray(
         InfrastructureError: the cluster cannot be reached or has not the resources, or task or agents cannot be sent.
         Error: what an actor raised on purpose, such as a broken contract.
     """
-    import_ray()
+    ray = import_ray()
+    is_own = config.address is None and not ray.is_initialized()
     end_idle_processes()
     pickle_spec(spec)  # what cannot be sent is said before a cluster is started
     with connect_cluster(config.address) as ray:
-        pool = _ActorPool(ray, spec, deque(jobs), receiver, workers, config)
+        pool = _ActorPool(ray, spec, deque(jobs), receiver, workers, config, is_own)
         try:
             pool.run()
         finally:
@@ -131,11 +145,21 @@ class _ActorPool:
     """The driver's side: leases jobs to actors, receives rows, and replaces actors and servers that are lost."""
 
     def __init__(
-        self, ray: Any, spec: WorkerSpec, jobs: deque[Job], receiver: ReportReceiver, size: int, config: EngineConfig
+        self,
+        ray: Any,
+        spec: WorkerSpec,
+        jobs: deque[Job],
+        receiver: ReportReceiver,
+        size: int,
+        config: EngineConfig,
+        is_own: bool = False,
     ) -> None:
+        """Make a pool; `is_own` says that the cluster is this run's alone."""
         self._ray, self._spec, self._jobs, self._receiver = ray, spec, jobs, receiver
         self._size, self._config = min(size, len(jobs)), config
         self._patience = Limits(**spec.limits).patience
+        self._cores = max(1, len(os.sched_getaffinity(0)) // max(1, self._size)) if is_own else 1
+        """Cores of Ray's that an actor asks for, and uses: an equal share of a cluster that nobody else uses."""
         self._leases: list[_Lease] = []
         self._begun = 0
         """Actors so far."""
@@ -196,7 +220,8 @@ class _ActorPool:
         what, seconds = ("actor", START_SECONDS) if serves else ("server", SERVER_SECONDS + START_SECONDS)
         gpus = config.worker_gpus if serves else max(config.server_gpus, config.vlm_server_gpus)
         return (
-            f"no {what} could be started within {seconds:g} s: expected a Ray cluster with a free core"
+            f"no {what} could be started within {seconds:g} s: expected a Ray cluster with "
+            f"{'a free core' if self._cores == 1 else f'{self._cores} free cores'}"
             f"{f' and {gpus:g} GPUs' if gpus else ''} for each; see `ray status`"
         )
 
@@ -207,10 +232,9 @@ class _ActorPool:
             pool.stop()
 
     def _start(self) -> _Lease:
-        threads = max(1, len(os.sched_getaffinity(0)) // self._size)
-        gpus = self._config.worker_gpus
-        kind = self._ray.remote(num_cpus=1, num_gpus=gpus, max_restarts=0, max_task_retries=0)(EpisodeActor)
-        actor = kind.remote(self._pickle_spec(), threads)
+        resources = {"num_cpus": self._cores, "num_gpus": self._config.worker_gpus}
+        kind = self._ray.remote(**resources, max_restarts=0, max_task_retries=0)(EpisodeActor)
+        actor = kind.remote(self._pickle_spec(), self._cores)
         self._begun += 1
         return _Lease(actor, rows=actor.prepare.remote())
 

@@ -13,7 +13,7 @@ import os
 import re
 import sqlite3
 from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
-from contextlib import ExitStack, contextmanager, suppress
+from contextlib import ExitStack, contextmanager, nullcontext, suppress
 from datetime import datetime, timezone
 from pathlib import Path
 from typing import Any
@@ -29,7 +29,7 @@ from wiw.runs.judges import JudgedRow, JudgeRecord, apply_judge, find_judge
 from wiw.runs.migrations import OLDEST_READABLE, is_newer, migrate, show_as_current
 from wiw.runs.processes import describe_process
 from wiw.runs.rows import AgentRow, DecisionRow, LostRow, OutcomeRow, build_episode, to_episode_values, to_json
-from wiw.runs.scratch import RECORDED, ScratchCopy
+from wiw.runs.scratch import RECORDED, ScratchCopy, SupersededError
 from wiw.runs.shapes import EDITED, check_decision, check_types, parse_column
 from wiw.runs.shards import Shard
 from wiw.runs.store_file import (
@@ -827,17 +827,18 @@ class RunStore:
 
     def _end(self, keep: bool) -> None:
         copy = None if self._lock is None else self._copy  # closed before
-        try:
-            if copy is not None and keep:
-                copy.copy(self._connection)
-            self._connection.close()
-            if copy is not None:
-                copy.remove()
-        finally:
-            self._connection.close()
-            if self._lock is not None:
-                self._lock.close()
-                self._lock = None
+        with nullcontext() if copy is None else copy.ending():
+            try:
+                if copy is not None and keep:
+                    copy.copy(self._connection)
+                self._connection.close()
+                if copy is not None:
+                    copy.remove()
+            finally:
+                self._connection.close()
+                if self._lock is not None:
+                    self._lock.close()
+                    self._lock = None
 
     def _discard_partial(self) -> None:
         with self._writing() as connection:
@@ -895,6 +896,8 @@ def leave_resumable(begun: RunStore) -> Iterator[None]:
     command = begun.resume_command
     try:
         yield
+    except SupersededError:  # another process continues the run
+        raise
     except Exception as error:
         with suppress(StoreError), RunStore.read(begun.local_file or begun.home) as store:
             if begun.local_file is None and not store.has_rows():  # home may lack rows that are left on the local disk

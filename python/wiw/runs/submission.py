@@ -3,8 +3,8 @@
 
 A job is this module's `JobCommand`, which starts the command as a separate process. Before the time limit, and when
 it is preempted with a warning, SLURM sends SIGUSR2: the command stops, everything recorded, and submitit requeues the
-job. At SIGTERM the command stops likewise; `--requeue` lets SLURM itself start the job again where it was preempted,
-and not where it was cancelled.
+job. At SIGTERM the command stops likewise, and the job ends with an error; `--requeue` lets SLURM itself start the job
+again where it was preempted, and not where it was cancelled, which the job cannot tell apart.
 """
 
 from __future__ import annotations
@@ -28,12 +28,17 @@ from tyro.conf import arg
 from wiw.errors import ArgumentError, DependencyError, InfrastructureError, StoreError
 from wiw.files import atomic_file
 from wiw.json_text import parse_json
+from wiw.runs.scratch import STOP_VARIABLE
 from wiw.runs.status import status
 
 SIGNAL_DELAY = 90
 """Seconds before the time limit at which SLURM sends SIGUSR2."""
-PATIENCE = 45.0
-"""Seconds that a command has for stopping; `wiw run` takes 5 at most, `wiw serve` 30 by default."""
+PATIENCE = SIGNAL_DELAY - 15.0
+"""Seconds that a command has for stopping, before its job is requeued; `wiw serve` takes 30 by default."""
+STOP_SECONDS = PATIENCE - 5.0
+"""Seconds after which `wiw run` ends though its store is still being copied to a shared disk."""
+STOPPED = frozenset((os.EX_TEMPFAIL, -signal.SIGTERM))
+"""Exit codes of commands that were told to stop."""
 FILE_NAME = "jobs.json"
 LOGS = "jobs"
 """Subfolder of the run's folder with submitit's files and the output of jobs."""
@@ -119,18 +124,29 @@ class JobCommand:
     def __init__(self, arguments: Sequence[str]) -> None:
         self.arguments = list(arguments)
         self._process: subprocess.Popen[bytes] | None = None
+        self._is_told = False
+        """Whether SIGTERM has come."""
 
     def __call__(self) -> int:
         """Run the command to completion and return its exit code.
 
         Raises:
-            InfrastructureError: it failed: its exit code is not 0, nor that of an invalid run whose episodes have all
-                ended.
+            InfrastructureError: it was stopped, or failed: its exit code is not 0, nor that of an invalid run whose
+                episodes have all ended.
         """
-        process = self._process = subprocess.Popen([sys.executable, "-m", "wiw.cli", *self.arguments])
-        signal.signal(signal.SIGTERM, self._forward_signal)
+        signal.signal(signal.SIGTERM, self._forward_signal)  # before there is a command: submitit lets SIGTERM pass
+        environment = {STOP_VARIABLE: f"{STOP_SECONDS:g}", **os.environ}
+        process = subprocess.Popen([sys.executable, "-m", "wiw.cli", *self.arguments], env=environment)
+        self._process = process
+        if self._is_told:
+            process.terminate()
         while (code := process.poll()) is None:  # wait() holds a lock that `checkpoint` would wait for
             time.sleep(0.1)
+        if self._is_told and code in STOPPED:
+            raise InfrastructureError(
+                f"stopped by SIGTERM, with everything recorded kept: {self}. SLURM starts it again if it has preempted "
+                "the job; otherwise submit it again to continue"
+            )
         if code != 0 and not (code == INVALID and _has_run_all(self.arguments)):
             raise InfrastructureError(f"exit code {code} of: {self}; its output says why. Submit it again to continue")
         return code
@@ -147,12 +163,13 @@ class JobCommand:
         return DelayedSubmission(type(self)(self.arguments))
 
     def __getstate__(self) -> dict[str, Any]:
-        return {"arguments": self.arguments, "_process": None}
+        return {"arguments": self.arguments, "_process": None, "_is_told": False}
 
     def __str__(self) -> str:
         return shlex.join(["wiw", *self.arguments])
 
     def _forward_signal(self, number: int, frame: FrameType | None) -> None:
+        self._is_told = True
         if self._process is not None:
             with suppress(ProcessLookupError):
                 os.kill(self._process.pid, number)

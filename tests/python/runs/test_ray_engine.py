@@ -132,6 +132,55 @@ def test_actors_without_work_take_that_of_a_lost_one(monkeypatch, loss):
     assert killed == [made[1]]  # Ray may have lost its answer alone
 
 
+@pytest.mark.parametrize(("is_own", "cores"), [(True, 4), (False, 1)])
+def test_an_actor_uses_the_cores_that_it_asks_for(monkeypatch, is_own, cores):
+    """In a cluster of the run's own, actors share all of them; in another one each has one."""
+    monkeypatch.setattr(os, "sched_getaffinity", lambda process: range(8))
+    asked = []
+    actor = SimpleNamespace(prepare=SimpleNamespace(remote=lambda: "started"))
+
+    def make(**options):
+        return lambda kind: SimpleNamespace(remote=lambda spec, threads: asked.append((options, threads)) or actor)
+
+    played = SimpleNamespace(remote=make, nodes=lambda: [{}], exceptions=EXCEPTIONS)
+    jobs = deque(Job("none", (episode,)) for episode in enumerate(LineTask().episodes(2)))
+    spec = WorkerSpec(None, {}, 0, "", 4, frozenset())
+    ray_engine._ActorPool(played, spec, jobs, None, 2, EngineConfig(engine="ray"), is_own)._start()
+    ((options, threads),) = asked
+    assert options["num_cpus"] == threads == cores
+
+
+ACTOR = """
+import sys
+import cv2
+from fakes import LineTask
+from wiw._core import core
+from wiw.runs.ray_engine import EpisodeActor
+from wiw.runs.recipes import TaskInMemory
+from wiw.runs.workers import WorkerSpec, pickle_spec
+if {before}:
+    import torch
+EpisodeActor(pickle_spec(WorkerSpec(TaskInMemory(LineTask()), {{}}, 0, "", 1, frozenset())), 1)
+import torch
+print(core.num_threads(), cv2.getNumThreads(), torch.get_num_threads())
+"""
+
+
+@pytest.mark.parametrize(("own", "before"), [({}, False), ({}, True), ({"WIW_NUM_THREADS": "2"}, False)])
+def test_an_actor_has_as_many_threads_as_cores(own, before):
+    pytest.importorskip("torch", reason="needs torch")
+    kept = {name: text for name, text in os.environ.items() if not name.endswith("_NUM_THREADS")}
+    done = subprocess.run(
+        [sys.executable, "-c", ACTOR.format(before=before)],
+        env={**kept, "PYTHONPATH": os.pathsep.join(sys.path), **own},
+        capture_output=True,
+        text=True,
+        check=True,
+    )
+    count = own.get("WIW_NUM_THREADS", "1")
+    assert done.stdout.split() == [count, count, "1"]
+
+
 def test_an_error_in_an_actor_is_no_loss_of_it():
     """Ray's error of a task is also of the class of its cause, which may be the loss of an actor of its own."""
 

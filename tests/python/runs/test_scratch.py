@@ -8,7 +8,10 @@ import logging
 import os
 import shlex
 import shutil
+import signal
 import sqlite3
+import subprocess
+import sys
 from collections.abc import Iterable, Iterator
 from contextlib import closing, contextmanager
 from pathlib import Path
@@ -18,8 +21,8 @@ import pytest
 from fakes import LineTask
 
 import wiw
-from wiw.cli.stop import Terminated, stoppable
-from wiw.errors import FileError, StoreError
+from wiw.cli.stop import Terminated, raise_on_stop_signals, stoppable
+from wiw.errors import ArgumentError, FileError, StoreError
 from wiw.runs import scratch, store_log
 from wiw.runs.rows import OutcomeRow
 from wiw.runs.status import _read_time
@@ -229,6 +232,109 @@ def test_a_copy_that_fails_meanwhile_is_tried_again(
         assert count(home) == 3
 
 
+@pytest.fixture
+def shared(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    """A run's folder that two machines see, on which nothing can be locked."""
+
+    def find_network(path: Path) -> str | None:
+        return "nfs4" if path.parent == tmp_path / "run" else None
+
+    for module in ("store", "store_file", "store_log"):
+        monkeypatch.setattr(f"wiw.runs.{module}.find_network", find_network)
+    return tmp_path / "run"
+
+
+@contextmanager
+def another_machine() -> Iterator[None]:
+    """While this lasts, processes are on another machine, and do not see the first one's disk."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr("wiw.runs.processes.platform.node", lambda: "two")
+        patch.setattr(RunStore, "_find_left", lambda path: None)
+        yield
+
+
+def start_twice(home: Path) -> tuple[RunStore, RunStore]:
+    """Return the stores of a process on a node that was lost after two episodes, and of the one in its place."""
+    first = create(home, home.with_name("one"), task={"name": "line"})
+    first.begin_session()
+    write(first, range(2))
+    assert first._copy is not None
+    first._copy.copy(first._connection)
+    with another_machine():
+        second = RunStore.resume(home, scratch=home.with_name("two"))
+        second.begin_session()
+    return first, second
+
+
+@pytest.mark.parametrize("ends", [False, True], ids=["goes on", "ends"])
+def test_a_process_that_comes_back_does_not_replace_the_store_of_its_successor(
+    shared: Path, monkeypatch: pytest.MonkeyPatch, ends: bool
+) -> None:
+    first, second = start_twice(shared)
+    write(second, range(2, 6))
+    second.close()
+    write(first, range(2, 4))
+    monkeypatch.setattr(scratch, "PERIOD", 0.0)
+    with pytest.raises(scratch.SupersededError) as caught, leave_resumable(first), first:
+        if not ends:
+            write(first, range(4, 5))
+    assert f"process {os.getpid()} on two" in str(caught.value) and not hasattr(caught.value, "__notes__")
+    assert f"wiw merge {shared} {first.path} --out NEW" in str(caught.value)
+    assert count(shared) == 6
+    with RunStore.read(first.path) as kept:
+        assert kept.count_ended() == (4 if ends else 5, 0)
+
+
+def test_a_process_goes_on_whose_predecessor_came_back(shared: Path) -> None:
+    first, second = start_twice(shared)
+    with pytest.raises(scratch.SupersededError), first:
+        write(first, range(2, 4))
+    write(second, range(2, 6))
+    second.close()
+    assert count(shared) == 6
+
+
+def test_two_processes_that_create_a_run_at_once_do_not_share_it(shared: Path) -> None:
+    first, second = (create(shared, shared.with_name(name)) for name in ("one", "two"))
+    first.begin_session()
+    with another_machine(), pytest.raises(scratch.SupersededError, match="written by another process"), second:
+        second.begin_session()
+    write(first, range(3))
+    first.close()
+    assert count(shared) == 3
+
+
+def test_what_a_superseded_process_left_is_set_aside_and_can_be_merged(
+    shared: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    first, second = start_twice(shared)
+    write(first, range(10, 15))
+    with pytest.raises(scratch.SupersededError):
+        first.close()
+    write(second, range(2, 4))
+    second.close()
+    with (
+        caplog.at_level(logging.WARNING, "wiw.runs"),
+        RunStore.resume(shared, scratch=shared.with_name("one")) as store,
+    ):
+        assert store.count_ended() == (4, 0)
+        write(store, range(4, 6))
+    aside = first.path.with_name("run-1.sqlite")
+    assert f"{aside} has 5 finished episodes" in caplog.text and count(shared) == 6
+    assert wiw.merge([shared, aside], shared.with_name("both"), shared.parent).ended == 11
+
+
+def test_what_a_superseded_process_left_is_dropped_where_its_successor_has_it(shared: Path) -> None:
+    first, second = start_twice(shared)
+    with pytest.raises(scratch.SupersededError):
+        first.close()
+    write(second, range(2, 4))
+    second.close()
+    with RunStore.resume(shared, scratch=shared.with_name("one")) as store:
+        assert store.count_ended() == (4, 0)
+    assert not list(shared.with_name("one").iterdir())
+
+
 @pytest.mark.parametrize("way", ["as printed", "without a folder", "with another folder"])
 def test_rows_that_a_process_left_are_taken_in(tmp_path: Path, way: str) -> None:
     home, local = tmp_path / "run", tmp_path / "local"
@@ -329,3 +435,103 @@ def test_a_run_without_a_scratch_folder_is_continued_without(tmp_path: Path) -> 
         store.begin_session()
     assert find_resume_command(home) == f"wiw resume {home}"
     assert find_resume_command(tmp_path / "none") == f"wiw resume {tmp_path / 'none'}"
+
+
+WRITER = """
+import hashlib, shutil, sys, time
+from pathlib import Path
+from test_scratch import create, write
+from wiw.cli import stop
+
+copyfile = shutil.copyfile
+
+def copy_slowly(source, target):
+    print("copying", flush=True)
+    time.sleep({copying})
+    copyfile(source, target)
+
+def work():
+    with create(Path(sys.argv[1]), Path(sys.argv[2])) as store:
+        store.begin_session()
+        write(store, range(5))
+        shutil.copyfile = copy_slowly
+        print("begun", flush=True)
+        {work}
+
+stop.GRACE = 0.5
+try:
+    with stop.raise_on_stop_signals():
+        work()
+except stop.Terminated:
+    stop.end_process(75)
+"""
+BUSY = "hashlib.pbkdf2_hmac('sha256', b'a', b'b', 1 << 30)"
+"""Takes minutes, in which Python handles no signal, but its other threads go on."""
+
+
+def start_writer(tmp_path: Path, work: str, copying: float, **environment: str) -> subprocess.Popen[str]:
+    code = WRITER.format(work=work, copying=copying)
+    process = subprocess.Popen(
+        ["env", "--default-signal=INT", sys.executable, "-c", code, str(tmp_path / "run"), str(tmp_path / "local")],
+        env={**os.environ, "PYTHONPATH": os.pathsep.join(sys.path), **environment},
+        stdout=subprocess.PIPE,
+        stderr=subprocess.PIPE,
+        text=True,
+    )
+    assert process.stdout is not None and process.stdout.readline() == "begun\n"
+    return process
+
+
+def test_a_stop_waits_for_the_store_to_be_copied(tmp_path: Path) -> None:
+    process = start_writer(tmp_path, "time.sleep(600)", copying=2.5)
+    process.send_signal(signal.SIGTERM)
+    _, shown = process.communicate(timeout=60)
+    assert (process.returncode, shown) == (75, "")
+    assert count(tmp_path / "run") == 5 and not list((tmp_path / "local").iterdir())
+
+
+def test_a_stop_copies_the_store_though_its_process_does_not_react(tmp_path: Path) -> None:
+    process = start_writer(tmp_path, BUSY, copying=0)
+    process.send_signal(signal.SIGTERM)
+    _, shown = process.communicate(timeout=60)
+    assert process.returncode == 75 and "stopped at once" in shown
+    assert count(tmp_path / "run") == 5
+
+
+@pytest.mark.parametrize("work", ["time.sleep(600)", BUSY])
+def test_a_copy_that_takes_too_long_ends_and_leaves_the_one_before(tmp_path: Path, work: str) -> None:
+    process = start_writer(tmp_path, work, copying=600, WIW_STOP_SECONDS="1.5")
+    process.send_signal(signal.SIGTERM)
+    _, shown = process.communicate(timeout=60)
+    assert process.returncode == 75 and "stopped at once" in shown
+    assert count(tmp_path / "run") == 0
+    with RunStore.resume(tmp_path / "run") as store:
+        assert store.count_ended() == (5, 0)
+
+
+def test_a_copy_that_fails_at_a_stop_is_said(tmp_path: Path) -> None:
+    process = start_writer(tmp_path, BUSY, copying=0)
+    (tmp_path / "run/run.sqlite").unlink()
+    (tmp_path / "run/run.sqlite").mkdir()
+    process.send_signal(signal.SIGTERM)
+    _, shown = process.communicate(timeout=60)
+    assert process.returncode == 75 and "is a folder" in shown and str(tmp_path / "local") in shown
+
+
+def test_a_second_ctrl_c_ends_a_copy_at_once(tmp_path: Path) -> None:
+    process = start_writer(tmp_path, "time.sleep(600)", copying=600)
+    process.send_signal(signal.SIGINT)
+    assert process.stdout is not None and process.stdout.readline() == "copying\n"
+    process.send_signal(signal.SIGINT)
+    process.communicate(timeout=60)
+    assert process.returncode != 0 and count(tmp_path / "run") == 0
+
+
+def test_seconds_for_stopping_are_a_number(monkeypatch: pytest.MonkeyPatch) -> None:
+    for text in ("soon", "nan", "-1", "inf"):
+        monkeypatch.setenv("WIW_STOP_SECONDS", text)
+        with (
+            pytest.raises(ArgumentError, match=f"WIW_STOP_SECONDS={text}: expected a number of seconds"),
+            raise_on_stop_signals(),
+        ):
+            pass

@@ -415,6 +415,29 @@ def test_network_file_systems_are_told_from_disks(network, tmp_path):
     assert file_systems.find_network(network.with_name("net")) is None  # a longer name is no folder in it
 
 
+@pytest.mark.parametrize(
+    ("kind", "found"),
+    [
+        *((kind, kind) for kind in ("gfs2", "fuse.daos", "fuse.mfs", "fuse.quobyte", "fuse.lizardfs")),
+        *((kind, f"{kind}, taken for one") for kind in ("9p", "virtiofs", "fuse", "fuse.unheard-of")),
+        *((kind, None) for kind in ("ext4", "tmpfs", "overlay", "fuseblk", "fuse.fuse-overlayfs")),
+    ],
+)
+def test_what_may_be_shared_counts_as_a_network_file_system(tmp_path, monkeypatch, kind, found):
+    """FUSE file systems that nobody has heard of, and folders of a host, such as WSL2's /mnt/c, may be shared."""
+    mounts = f"22 1 8:1 / / rw shared:1 - ext4 /dev/sda1 rw\n40 22 0:50 / {tmp_path} rw - {kind} any rw\n"
+    (tmp_path / "mountinfo").write_text(mounts)
+    monkeypatch.setattr(file_systems, "MOUNTS", tmp_path / "mountinfo")
+    assert file_systems.find_network(tmp_path / "run/run.sqlite") == found
+
+
+@pytest.mark.parametrize(("kind", "found"), [("9p", None), ("virtiofs", None), ("fuse.own", None), ("nfs4", "nfs4")])
+def test_the_root_folder_of_a_container_is_its_own(tmp_path, monkeypatch, kind, found):
+    (tmp_path / "mountinfo").write_text(f"22 1 8:1 / / rw shared:1 - {kind} any rw\n")
+    monkeypatch.setattr(file_systems, "MOUNTS", tmp_path / "mountinfo")
+    assert file_systems.find_network(tmp_path) == found
+
+
 def test_scores_of_frames_have_no_log_on_a_network_file_system(network):
     for folder, log in ((network, "delete"), (network / "disk", "wal")):
         folder.mkdir(exist_ok=True)

@@ -8,10 +8,13 @@ import os
 import shlex
 import signal
 import stat
+import subprocess
 import sys
 import time
+from contextlib import suppress
 from dataclasses import replace
 from pathlib import Path
+from types import SimpleNamespace
 
 import pytest
 from locations import PYTHON_TESTS
@@ -20,6 +23,7 @@ import wiw
 from wiw.cli import main
 from wiw.cli.command_line import format_flags
 from wiw.cli.parts import AgentFlags, TaskFlags
+from wiw.cli.stop import LAST
 from wiw.cli.submit import SECRETS
 from wiw.errors import ArgumentError, DependencyError, InfrastructureError, StoreError
 from wiw.loop.config import AgentConfig
@@ -27,6 +31,9 @@ from wiw.runs.config import RunConfig
 from wiw.runs.store import _hide_secret
 from wiw.runs.submission import (
     LOGS,
+    PATIENCE,
+    SIGNAL_DELAY,
+    STOP_SECONDS,
     ClusterConfig,
     JobCommand,
     SubmittedJob,
@@ -376,7 +383,9 @@ text = open(script).read()
 open(os.environ["FAKE_SLURM"] + "/script", "w").write(text)
 first, last = map(int, re.search(r"--array=(\\d+)-(\\d+)", text).groups()) if "--array" in text else (0, 0)
 for number in range(first, last + 1):
-    loop = f'bash {script}; while rm "$FAKE_SLURM/requeue_{number}"; do bash {script}; done'
+    own = f'run() {{ bash {script}; echo $? >> "$FAKE_SLURM/exit_{number}"; }}'
+    held = f'while [ -e "$FAKE_SLURM/hold_{number}" ]; do sleep 0.05; done'
+    loop = f'{own}; run; {held}; while rm "$FAKE_SLURM/requeue_{number}"; do run; done'
     job = {"SLURM_JOB_ID": str(700 + number), "SLURM_ARRAY_JOB_ID": "70", "SLURM_ARRAY_TASK_ID": str(number)}
     log = open(os.environ["FAKE_SLURM"] + f"/log_{number}", "w")
     subprocess.Popen(["bash", "-c", loop], env={**os.environ, **job}, stdout=log, stderr=log, start_new_session=True)
@@ -442,6 +451,83 @@ def test_an_array_of_slurm_jobs(tmp_path, slurm, capsys):
     assert wiw.merge([out], out).complete and wiw.verify(out).same
     assert main(["cancel", str(out)]) == 0 and not (slurm / "cancelled").exists()  # none is left
     assert "job 70_0" in json.dumps(main(["status", str(out)]) or capsys.readouterr().out)
+
+
+def signal_step(slurm, numbers):
+    """Send signals to all processes of the first job's step, as SLURM does, and wait until it has ended."""
+    task = int((slurm / "pid_0").read_text())
+    for number in numbers:
+        for process in [*find_children(task), task]:
+            with suppress(ProcessLookupError):
+                os.kill(process, number)
+    wait_for((slurm / "exit_0").exists)
+
+
+@pytest.mark.parametrize(
+    ("numbers", "requeued"),
+    [((signal.SIGCONT, signal.SIGTERM), False), ((signal.SIGUSR2, signal.SIGCONT, signal.SIGTERM), True)],
+    ids=["SIGTERM", "SIGUSR2 and SIGTERM"],
+)
+def test_a_job_that_slurm_preempts_by_sigterm_has_copied_its_store_and_goes_on(tmp_path, slurm, numbers, requeued):
+    """SLURM itself requeues the job; at SIGTERM alone nobody else asks for that, as it may have been cancelled."""
+    out, held = tmp_path / "run", slurm / "hold_0"
+    held.touch()  # a job that was requeued is held for a while
+    assert submit(out, "--live", 1, cluster="slurm", scenes="slow", episodes=8) == 0
+    wait_for(lambda: (slurm / "pid_0").exists() and count_of_shard(tmp_path) >= 2)
+    recorded = count_of_shard(tmp_path)
+    signal_step(slurm, numbers)
+    (shard,) = [store for store in wiw.status(out).stores if store.shard.number == 1]
+    assert shard.state == "stopped" and recorded <= shard.ended < 4, logs(out)
+    assert not list((tmp_path / "disk").glob("shard-1-of-2*/run.sqlite"))
+    assert (slurm / "requeued").exists() == requeued
+    shown = (slurm / "log_0").read_text()
+    assert ("stopped by SIGTERM, with everything recorded kept: wiw run" in shown) != requeued, shown
+    assert (slurm / "exit_0").read_text() != "0\n"
+    (slurm / "requeue_0").touch()
+    held.unlink()
+    wait_for(lambda: wiw.status(out).ended == 8)
+    wait_for(lambda: (slurm / "exit_0").read_text().endswith("\n0\n"))
+    assert wiw.merge([out], out).complete and wiw.verify(out).same
+
+
+def count_of_shard(tmp_path):
+    """Return how many episodes of the first of two shards have ended in the store on its job's own disk."""
+    found = list((tmp_path / "disk").glob("shard-1-of-2*/run.sqlite"))
+    try:
+        return sum(len(load_run(path).episodes) for path in found)
+    except StoreError:  # being made
+        return 0
+
+
+def test_a_job_that_is_told_to_stop_before_its_command_has_begun_ends(monkeypatch):
+    """Until then the signal is submitit's, which lets it pass."""
+
+    def start(command, **options):
+        os.kill(os.getpid(), signal.SIGTERM)
+        return popen([sys.executable, "-c", "import time; time.sleep(20)"])
+
+    popen = subprocess.Popen
+    monkeypatch.setattr("wiw.runs.submission.subprocess.Popen", start)
+    earlier = signal.signal(signal.SIGTERM, lambda number, frame: None)
+    try:
+        with pytest.raises(InfrastructureError, match="stopped by SIGTERM"):
+            JobCommand(["run", "imagenav"])()
+    finally:
+        signal.signal(signal.SIGTERM, earlier)
+
+
+def test_a_command_is_told_how_long_it_has_which_is_less_than_its_job(monkeypatch):
+    told = []
+    monkeypatch.setattr(
+        "wiw.runs.submission.subprocess.Popen",
+        lambda command, env: told.append(env["WIW_STOP_SECONDS"]) or SimpleNamespace(poll=lambda: 0),
+    )
+    monkeypatch.setattr("wiw.runs.submission.signal.signal", lambda number, handler: None)
+    for own in (None, "20"):
+        if own is not None:
+            monkeypatch.setenv("WIW_STOP_SECONDS", own)
+        assert JobCommand(["run"])() == 0
+    assert told == [f"{STOP_SECONDS:g}", "20"] and STOP_SECONDS + LAST < PATIENCE < SIGNAL_DELAY
 
 
 STATES = (

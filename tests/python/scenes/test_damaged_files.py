@@ -443,17 +443,67 @@ def test_an_importer_without_its_parent_does_not_begin() -> None:
     assert done.returncode == 1 and done.stdout == ""
 
 
-def test_a_container_s_memory_is_the_limit(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+@pytest.fixture
+def system(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    """A root folder for the system's files, of a machine with 1 GB."""
+    monkeypatch.setattr(process_limits, "_ROOT", tmp_path)
+    monkeypatch.setattr(os, "sysconf", lambda name: {"SC_PAGE_SIZE": 1 << 12, "SC_PHYS_PAGES": 1 << 18}[name])
+    (tmp_path / "proc/self").mkdir(parents=True)
+    return tmp_path
+
+
+def set_limits(folder: Path, name: str, limits: dict[str, str]) -> None:
+    for group, text in limits.items():
+        (folder / group).mkdir(parents=True, exist_ok=True)
+        (folder / group / name).write_text(f"{text}\n")
+
+
+JOB = "system.slice/slurmstepd.scope/job_7/step_0/user/task_0"
+MOUNTED = {
+    "v2": "31 23 0:28 / /sys/fs/cgroup rw,relatime shared:4 - cgroup2 cgroup2 rw,nsdelegate",
+    "v1": "34 31 0:30 / /sys/fs/cgroup/cpu rw - cgroup cgroup rw,cpu\n"
+    "35 31 0:31 {root} /sys/fs/cgroup/memory rw - cgroup cgroup rw,memory",
+}
+
+
+@pytest.mark.parametrize("mounted", [MOUNTED["v2"], ""])
+def test_the_least_limit_of_all_groups_above_holds(system: Path, mounted: str) -> None:
+    (system / "proc/self/cgroup").write_text(f"0::/{JOB}\n")
+    (system / "proc/self/mountinfo").write_text(mounted)
+    place, above = system / "sys/fs/cgroup", JOB.rpartition("/step_0")[0]
+    set_limits(place, "memory.max", {JOB: "max", f"{above}/step_0": f"{1 << 28}", above: f"{1 << 27}"})
+    assert process_limits.find_memory_limit() == 3 << 25
+    set_limits(place, "memory.max", {above: "max"})
+    assert process_limits.find_memory_limit() == 3 << 26
+
+
+@pytest.mark.parametrize("root", ["/", "/slurm", "/elsewhere"])
+def test_a_group_of_the_memory_controller_alone_has_the_limit(system: Path, root: str) -> None:
+    """The last root is that of a container that does not show its own group: what is mounted then is its own."""
+    (system / "proc/self/cgroup").write_text("9:cpu:/slurm\n4:memory:/slurm/uid_1/job_7/step_0\n0::/\n")
+    (system / "proc/self/mountinfo").write_text(MOUNTED["v1"].format(root=root))
+    job = {"/": "slurm/uid_1/job_7", "/slurm": "uid_1/job_7", "/elsewhere": "."}[root]
+    limits = {job: f"{1 << 28}", f"{job}/step_0": f"{(1 << 63) - (1 << 12)}"}
+    set_limits(system / "sys/fs/cgroup/memory", "memory.limit_in_bytes", limits)
+    assert process_limits.find_memory_limit() == 3 << 26
+
+
+def test_without_groups_the_machine_s_memory_is_the_limit(system: Path) -> None:
+    assert process_limits.find_memory_limit() == 3 << 28
+    (system / "proc/self/cgroup").write_text("0::/../other\nnonsense\n")
+    (system / "proc/self/mountinfo").write_text("nonsense\n")
+    assert process_limits.find_memory_limit() == 3 << 28
+    set_limits(system / "sys/fs/cgroup", "memory.max", {".": f"{1 << 28}"})
+    assert process_limits.find_memory_limit() == 3 << 26
+
+
+def test_a_container_s_memory_is_the_limit(system: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     limits: list[tuple[int, int]] = []
     monkeypatch.setattr(resource, "setrlimit", lambda _, pair: limits.append(pair))
     monkeypatch.setattr(resource, "getrlimit", lambda _: (resource.RLIM_INFINITY, resource.RLIM_INFINITY))
-    (tmp_path / "max").write_text("max\n")
-    (tmp_path / "some").write_text(f"{1 << 28}\n")
-    monkeypatch.setattr(process_limits, "_CGROUPS", (str(tmp_path / "max"), str(tmp_path / "none")))
-    machine = process_limits.limit_memory()
-    monkeypatch.setattr(process_limits, "_CGROUPS", (str(tmp_path / "some"),))
-    assert process_limits.limit_memory() == 3 << 26 < machine
-    assert [pair[0] for pair in limits] == [machine, 3 << 26]
+    set_limits(system / "sys/fs/cgroup", "memory.max", {".": f"{1 << 28}"})
+    assert process_limits.limit_memory() == 3 << 26
+    assert [pair[0] for pair in limits] == [3 << 26]
 
 
 def until(condition: Callable[[], bool]) -> None:
