@@ -221,6 +221,31 @@ def read_frames(path: Path) -> Any:
     return FrameFile(path).read_segment(0)
 
 
+def make_lerobot_info(folder: Path) -> bytes:
+    """Export a demonstration of three frames into the folder; return what describes the files of the dataset."""
+    from test_lerobot import make_up
+
+    from wiw.datasets import shards
+    from wiw.datasets.lerobot import export_lerobot
+
+    made, lerobot = folder / "made", folder / "lerobot"
+    made.mkdir()
+    manifest = {"tasks": ["made"], "episodes": 1, "size": 8, "depth": False}
+    (made / "manifest.json").write_text(json.dumps(manifest))
+    shards.write(made / "made-00000.parquet", [make_up(np.random.default_rng(0), 3, 0, False)], {"task": "made"})
+    export_lerobot(made, lerobot)
+    return (lerobot / "meta/info.json").read_bytes()
+
+
+def read_lerobot_info(data: bytes, folder: Path) -> Any:
+    from wiw.datasets.lerobot import manipulation
+    from wiw.datasets.lerobot.reading import LeRobotFolder
+
+    (folder / "lerobot/meta/info.json").write_bytes(data)
+    found = LeRobotFolder(folder / "lerobot")
+    return list(found.read_episodes(manipulation.describe_features(found.source["manifest"]), manipulation.FACTS))
+
+
 def make_weights(path: Path) -> None:
     from wiw.policies.navigator import weights
     from wiw.policies.navigator.network import Network
@@ -592,5 +617,6 @@ READERS: dict[str, Reader] = {
     "weights": Reader(
         write_and_take("w.safetensors", make_weights), from_file("w.safetensors", read_weights), "safetensors"
     ),
+    "info of LeRobot": Reader(make_lerobot_info, read_lerobot_info, "json"),
     "frames": Reader(write_and_take("f.parquet", make_frames), from_file("f.parquet", read_frames)),
 }

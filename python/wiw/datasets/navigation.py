@@ -25,7 +25,7 @@ from wiw.datasets.navigation_card import build_card
 from wiw.datasets.navigation_files import FORMAT, SEGMENTS, FrameFile, read_segment_list
 from wiw.datasets.navigation_segment import NavigationSegment
 from wiw.datasets.parquet_files import MANIFEST, require_pyarrow
-from wiw.datasets.scene_splits import name_scene
+from wiw.datasets.scene_splits import find_shared_scene
 from wiw.errors import ArgumentError, FileError
 from wiw.files import atomic_file
 from wiw.mapping_files import read_json_object
@@ -99,9 +99,11 @@ class NavigationData(Sequence[NavigationSegment]):
         return {strip_edits(row["scene"]) for row in self.segments}
 
     def find_shared(self, specs: Iterable[str]) -> str | None:
-        """Return the first of some scenes that is in the dataset too, whatever its edits; None if none is."""
-        own = self.scenes
-        return next((spec for spec in specs if strip_edits(name_scene(spec)) in own), None)
+        """Return the first of some scenes that may be in the dataset too, whatever its edits; None if none may.
+
+        Only names are known: a file may be one of the dataset's if the end of its path is the name of that.
+        """
+        return find_shared_scene(specs, self.scenes)
 
     @property
     def frames(self) -> int:

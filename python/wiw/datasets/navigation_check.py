@@ -6,6 +6,7 @@ from __future__ import annotations
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from hashlib import blake2b
+from itertools import combinations
 from pathlib import Path
 from typing import Any
 
@@ -16,7 +17,7 @@ from wiw.datasets.navigation import META, NavigationData
 from wiw.datasets.navigation_files import FrameFile
 from wiw.datasets.navigation_segment import NavigationSegment, describe_segment
 from wiw.datasets.parquet_files import hash_file
-from wiw.datasets.scene_splits import list_evaluation_scenes
+from wiw.datasets.scene_splits import list_evaluation_scenes, match_names
 from wiw.errors import FileError
 
 STEP_TOLERANCE = 0.011
@@ -128,12 +129,10 @@ def _check_splits(data: NavigationData, found: Verification) -> None:
 
 def _check_leaks(datasets: Sequence[NavigationData], found: Verification) -> None:
     """Look for scenes that two datasets share; an edited apartment counts as the one it is a copy of."""
-    owners: dict[str, NavigationData] = {}
-    for data in datasets:
-        for scene in sorted(data.scenes):
-            other = owners.setdefault(scene, data)
-            if other is not data:
-                found.add("leak", f"{scene} is in {other.folder} and in {data.folder}")
+    for other, data in combinations(datasets, 2):
+        for name, scene in match_names(other.scenes, data.scenes):
+            alias = "" if name == scene else f", as {scene}"
+            found.add("leak", f"{name} is in {other.folder} and in {data.folder}{alias}")
 
 
 def _check_frames(data: NavigationData, name: str, found: Verification, seen: _Pictures | None) -> None:

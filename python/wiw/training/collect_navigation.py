@@ -32,7 +32,7 @@ from wiw.datasets.navigation_files import (
 )
 from wiw.datasets.navigation_segment import describe_segment
 from wiw.datasets.parquet_files import require_pyarrow
-from wiw.datasets.scene_splits import find_evaluation_split, name_scene
+from wiw.datasets.scene_splits import find_evaluation_split, name_scenes
 from wiw.datasets.worlds import World, world
 from wiw.errors import ArgumentError, BackendError, Error, FileError, InfrastructureError
 from wiw.files import atomic_file
@@ -137,22 +137,16 @@ def resolve_train_scenes(scenes: str | PathLike[str] | Sequence[str | PathLike[s
     """Return the single scenes of some specs, by the names that they have in a dataset.
 
     Raises:
-        ArgumentError: a scene is of a split that is for evaluation, or two scenes have one name.
+        ArgumentError: a scene is of a split that is for evaluation, or is given twice.
         FileError: the file does not exist.
     """
     given = [scenes] if isinstance(scenes, str | PathLike) else list(scenes)
-    names: dict[str, str] = {}
-    for spec in (single for each in given for single in resolve(each)):
+    specs = [single for each in given for single in resolve(each)]
+    for spec in specs:
         _check_train_split(spec)
-        name = name_scene(spec)
-        if name in names:
-            raise ArgumentError(
-                f"collect: expected scenes of different names, got {name} twice ({names[name]}, {spec})"
-            )
-        names[name] = spec
-    if not names:
+    if not specs:
         raise ArgumentError("collect: expected scenes (--scenes apartments:train:80), got none")
-    return names
+    return name_scenes(specs)
 
 
 def _check_train_split(spec: str) -> None:
@@ -198,13 +192,7 @@ class SceneJob:
             raise
         except Error as error:
             return {"error": str(error)}
-        schema = navigation_schema(self.options.depth, describe_data(self.options))
-        jobs = [(traversal, index) for traversal in traversals for index in range(len(traversal.segments))]
-        for number, (traversal, index) in enumerate(jobs):
-            if not self._holds(number, traversal, index):
-                made = record_segment(place, self.scene, self.pass_index, number, traversal, index, self.options)
-                write_frames(self._part(number), schema, [build_table(made, schema)])
-        files, segments = self._merge_parts(jobs, schema)
+        files, segments = self.record_files(place, traversals)
         record = {
             "scene": self.scene,
             "pass": self.pass_index,
@@ -216,6 +204,22 @@ class SceneJob:
             draft.write_text(json.dumps(record) + "\n")
         shutil.rmtree(self._part(0).parent, ignore_errors=True)
         return record
+
+    def record_files(
+        self, place: World, traversals: Sequence[Traversal]
+    ) -> tuple[dict[str, dict[str, Any]], list[dict[str, Any]]]:
+        """Record the segments that are not there yet and write the files of all; return what is in each of both.
+
+        Raises:
+            FileError: a file cannot be written.
+        """
+        schema = navigation_schema(self.options.depth, describe_data(self.options))
+        jobs = [(traversal, index) for traversal in traversals for index in range(len(traversal.segments))]
+        for number, (traversal, index) in enumerate(jobs):
+            if not self._holds(number, traversal, index):
+                made = record_segment(place, self.scene, self.pass_index, number, traversal, index, self.options)
+                write_frames(self._part(number), schema, [build_table(made, schema)])
+        return self._merge_parts(jobs, schema)
 
     @property
     def _record_path(self) -> Path:

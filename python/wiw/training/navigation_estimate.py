@@ -4,18 +4,23 @@
 from __future__ import annotations
 
 import math
-import time
+import resource
 from collections.abc import Callable, Collection, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+from tempfile import TemporaryDirectory
 from typing import Any
 
 import numpy as np
 
-from wiw.datasets.worlds import world
-from wiw.nav import NavMesh
-from wiw.scenes import is_generated, open_outline
-from wiw.training.collect_navigation import resolve_train_scenes
-from wiw.training.navigation_recording import NavigationCollection, find_sources, read_collection, record_segment
+from wiw.datasets.navigation_files import FrameFile
+from wiw.datasets.worlds import World, world
+from wiw.nav import Ground, NavMesh
+from wiw.render import Renderer
+from wiw.scenes import apartment, is_generated, open_outline
+from wiw.scenes.specs import parse_single
+from wiw.training.collect_navigation import SceneJob, resolve_train_scenes
+from wiw.training.navigation_recording import NavigationCollection, find_sources, read_collection
 from wiw.training.traversal import Traversal, plan_scene
 
 PLANNED_SCENES, RECORDED_SCENES = 32, 4
@@ -42,8 +47,17 @@ class Estimate:
     """Mean share of the floor within 1 m of a frame, weighted by area."""
     dropped: int
     gigabytes: float
-    core_hours: float
-    """Hours of one core of this machine."""
+    opening_hours: float
+    """Hours of one core of this machine, for opening each scene once, as one worker does; less where the cache has the
+    files of scenes already."""
+    planning_hours: float
+    recording_hours: float
+    """For rendering, encoding and writing the pictures."""
+
+    @property
+    def core_hours(self) -> float:
+        """Hours of one core of this machine, without the start of the workers."""
+        return self.opening_hours + self.planning_hours + self.recording_hours
 
     def __str__(self) -> str:
         planned = "" if self.planned_scenes == self.scenes else f" (estimated from {self.planned_scenes} of them)"
@@ -52,7 +66,9 @@ class Estimate:
             f"{self.scenes} scenes{planned}: {self.frames:,} frames{error} in {self.segments:,} segments, "
             f"{self.windows:,} windows of {CLIP} frames\n"
             f"coverage {self.coverage:.0%} of the floor within 1 m; {self.dropped} waypoints dropped\n"
-            f"{self.pictures:,} pictures, {self.gigabytes:.1f} GB, {self.core_hours:.1f} core hours on this machine"
+            f"{self.pictures:,} pictures, {self.gigabytes:.1f} GB, {self.core_hours:.1f} core hours on this machine: "
+            f"{self.opening_hours:.1f} to open scenes, {self.planning_hours:.1f} to plan, {self.recording_hours:.1f} "
+            "to record"
         )
 
 
@@ -80,21 +96,15 @@ def estimate_collection(
     specs = list(resolve_train_scenes(scenes).items())
     chosen = _spread(specs, PLANNED_SCENES)
     recorded = _spread(chosen, RECORDED_SCENES)
-    plans = []
+    cost, plans = _Cost(), []
     for done, (name, spec) in enumerate(chosen, 1):
-        navmesh, roofs = _open_floors(spec, options)
-        plans.append(plan_scene(navmesh, name, options.seed, 0, options.rules, roofs))
+        plans.append(_plan(name, spec, options, cost))
         if progress is not None:
             progress(name, done, len(chosen))
-    cost = _record_samples(
-        [
-            (spec, traversals)
-            for (name, spec), traversals in zip(chosen, plans, strict=True)
-            if (name, spec) in recorded
-        ],
-        options,
-    )
-    return _extrapolate(plans, cost, len(specs), options)
+    for (name, spec), traversals in zip(chosen, plans, strict=True):
+        if (name, spec) in recorded:
+            _record_sample(name, spec, traversals, options, cost)
+    return _extrapolate(plans, cost, [spec for _, spec in specs], options)
 
 
 def _spread(specs: Sequence[tuple[str, str]], count: int) -> list[tuple[str, str]]:
@@ -103,44 +113,98 @@ def _spread(specs: Sequence[tuple[str, str]], count: int) -> list[tuple[str, str
     return [specs[int(number * step)] for number in range(min(count, len(specs)))]
 
 
-def _open_floors(spec: str, options: NavigationCollection) -> tuple[NavMesh, Collection[int]]:
+@dataclass
+class _Cost:
+    """What was spent on samples: seconds of one core, and bytes."""
+
+    opening: dict[bool, list[float]] = field(default_factory=lambda: {True: [], False: []})
+    """Seconds of each scene that was opened, of apartments (True) and files."""
+    planning: list[float] = field(default_factory=list)
+    """Seconds of each pass that was planned."""
+    recording: float = 0.0
+    """Seconds for all `pictures`."""
+    pictures: int = 0
+    bytes: int = 0
+    """Of all pictures."""
+
+    def estimate_opening(self, specs: Sequence[str]) -> float:
+        """Return the seconds that opening scenes takes, each as others of its kind that were opened."""
+        mean = {kind: _divide(sum(times), len(times)) for kind, times in self.opening.items()}
+        return sum(mean[is_generated(spec)] for spec in specs)
+
+
+def _divide(total: float, count: int) -> float:
+    """Return the mean; 0 of nothing."""
+    return total / count if count else 0.0
+
+
+def _read_clock() -> float:
+    """Return the seconds that cores have spent on this process, and on those that read files of scenes for it."""
+    used = [resource.getrusage(whose) for whose in (resource.RUSAGE_SELF, resource.RUSAGE_CHILDREN)]
+    return sum(each.ru_utime + each.ru_stime for each in used)
+
+
+def _plan(name: str, spec: str, options: NavigationCollection, cost: _Cost) -> list[Traversal]:
+    """Return the first pass over a scene, and count what opening and planning take."""
+    navmesh, roofs = _open_floors(spec, options, cost)
+    began = _read_clock()
+    plan = plan_scene(navmesh, name, options.seed, 0, options.rules, roofs)
+    cost.planning.append(_read_clock() - began)
+    return plan
+
+
+def _open_floors(spec: str, options: NavigationCollection, cost: _Cost) -> tuple[NavMesh, Collection[int]]:
     """Return a scene's navigation mesh and its roofs.
 
     An apartment is opened without its textures and light, in a fraction of the time; it has no roof to walk on.
     """
     if is_generated(spec):
         return NavMesh.build(open_outline(spec)), ()
-    place = world(spec, options.backend)
+    place = _open_world(spec, options, cost)
     return place.navmesh, place.roofs
 
 
-@dataclass(frozen=True)
-class _Cost:
-    """Mean cost of a picture."""
+def _open_world(spec: str, options: NavigationCollection, cost: _Cost) -> World:
+    """Return a scene as it is opened for recording, and count what that takes.
 
-    bytes: float = 0.0
-    seconds: float = 0.0
+    An apartment is generated even if the cache has it, as there is no room for those of a large collection.
+    """
+    began = _read_clock()
+    place = _generate_world(spec, options) if is_generated(spec) else world(spec, options.backend)
+    _ = place.roofs  # which a pass looks for before it is planned
+    cost.opening[is_generated(spec)].append(_read_clock() - began)
+    return place
 
 
-def _record_samples(scenes: Sequence[tuple[str, Sequence[Traversal]]], options: NavigationCollection) -> _Cost:
-    """Record the first segment of each scene, and return what a picture takes."""
-    size = count = 0
-    seconds = 0.0
-    for spec, traversals in scenes:
-        for traversal in [each for each in traversals if each.segments][:1]:
-            place = world(spec, options.backend)
-            began = time.process_time()
-            segment = record_segment(place, spec, 0, 0, traversal, 0, options)
-            seconds += time.process_time() - began
-            count += sum(each is not None for each in segment.encoded_images)
-            size += sum(len(data or b"") for data in (*segment.encoded_images, *(segment.encoded_depths or ())))
-    return _Cost(size / count, seconds / count) if count else _Cost()
+def _generate_world(spec: str, options: NavigationCollection) -> World:
+    """Return an apartment that is neither taken from a cache nor kept there."""
+    seed, split, edits = parse_single(spec)
+    scene = apartment(seed, split, cache=False, edits=edits)
+    renderer = Renderer(scene, backend=options.backend)
+    return World(spec, scene, renderer, NavMesh.build(scene), Ground(scene), options.backend)
+
+
+def _record_sample(
+    name: str, spec: str, traversals: Sequence[Traversal], options: NavigationCollection, cost: _Cost
+) -> None:
+    """Record the first segment of a scene, write its files, and count what that takes."""
+    place = _open_world(spec, options, cost) if is_generated(spec) else world(spec, options.backend)
+    walked = [replace(each, segments=each.segments[:1]) for each in traversals if each.segments][:1]
+    if not walked:
+        return
+    with TemporaryDirectory(prefix="wiw-estimate-") as folder:
+        began = _read_clock()
+        files, _ = SceneJob(0, name, spec, 0, Path(folder), options).record_files(place, walked)
+        cost.recording += _read_clock() - began
+        (segment,) = (FrameFile(Path(folder) / file).read_segment(0) for file in files)
+    cost.pictures += sum(each is not None for each in segment.encoded_images)
+    cost.bytes += sum(len(data or b"") for data in (*segment.encoded_images, *(segment.encoded_depths or ())))
 
 
 def _extrapolate(
-    plans: Sequence[Sequence[Traversal]], cost: _Cost, scenes: int, options: NavigationCollection
+    plans: Sequence[Sequence[Traversal]], cost: _Cost, specs: Sequence[str], options: NavigationCollection
 ) -> Estimate:
-    factor = scenes / len(plans) * options.passes
+    scenes, factor = len(specs), len(specs) / len(plans) * options.passes
     traversals = [each for plan in plans for each in plan]
     segments = [segment for each in traversals for segment in each.segments]
     area = sum(each.area for each in traversals)
@@ -156,8 +220,10 @@ def _extrapolate(
         pictures=round(pictures),
         segments=round(factor * len(segments)),
         windows=round(factor * sum(max(0, len(segment) - CLIP + 1) for segment in segments)),
-        coverage=sum(each.coverage * each.area for each in traversals) / area,
+        coverage=sum(each.coverage * each.area for each in traversals) / area if area else 0.0,
         dropped=round(factor * sum(each.dropped for each in traversals)),
-        gigabytes=pictures * cost.bytes / 1e9,
-        core_hours=pictures * cost.seconds / 3600,
+        gigabytes=pictures * _divide(cost.bytes, cost.pictures) / 1e9,
+        opening_hours=cost.estimate_opening(specs) / 3600,
+        planning_hours=factor * sum(cost.planning) / 3600,
+        recording_hours=pictures * _divide(cost.recording, cost.pictures) / 3600,
     )

@@ -378,13 +378,44 @@ def write(file: str, text: str) -> Callable[[Path], None]:
     return lambda folder: (folder / file).write_text(text)  # type: ignore[func-returns-value]
 
 
+@pytest.mark.parametrize("number", ["00{file_index}", "{file_index:3}", "{file_index:03}", "{file_index:03d}"])
+def test_names_of_files_may_be_written_otherwise(exported: Path, tmp_path: Path, number: str) -> None:
+    folder = shutil.copytree(exported / "views", tmp_path / "renamed")
+    edit_info(data_path=f"frames {number}.parquet")(folder)
+    (folder / FRAME_FILE).rename(folder / f"frames {number}.parquet".format(file_index=0))
+    assert len(import_lerobot(folder, tmp_path / "back")) > 0
+
+
+BAD_PATHS: tuple[Any, ...] = (
+    "data/{episode}.parquet",
+    "data/{chunk_index.__class__}.parquet",
+    "data/{chunk_index!r}.parquet",
+    "data/{chunk_index:>99999}.parquet",
+    "data/{chunk_index:099d}.parquet",
+    "data/{chunk_index:{file_index}}.parquet",
+    "data/{chunk_index",
+    "data/{}.parquet",
+    "../navigation/data/chunk-000/file-000.parquet",
+    "/data/chunk-{chunk_index:03d}/file-{file_index:03d}.parquet",
+    "data/chunk\0{chunk_index:03d}.parquet",
+    "data/chunk-000/file-000.arrow",
+    3,
+)
+"""Templates of names of files that are none, lead elsewhere or would fill the memory."""
+
+
 @pytest.mark.parametrize(
     ("damage", "words"),
     [
         (edit_info(codebase_version="v2.1"), "format v3.0, got v2.1"),
         (edit_info(fps=30), "expected 30 frames per second .* timestamps of 5"),
         (edit_info(total_episodes=99), "expected 99 episodes .* got "),
-        (edit_info(data_path="data/{episode}.parquet"), "data_path of chunk_index and file_index"),
+        *((edit_info(data_path=path), "data_path of chunk_index and file_index within") for path in BAD_PATHS),
+        (edit_info(fps=float("nan")), "expected nan frames per second"),
+        (edit_info(fps=10**400), "frames per second .* timestamps of 5"),
+        (set_column(EPISODE_FILE, "data/file_index", -1), "whole numbers from 0 as data/file_index, got -1"),
+        (set_column(EPISODE_FILE, "length", None), "whole numbers from 0 as length, got None"),
+        (set_column(EPISODE_FILE, "length", 2**60), "expected frames 0 to .* of episode 0, got others"),
         (edit_info(features={}), "got no observation.state"),
         (edit_feature(RGB, dtype="video"), "as image .* got video .* no longer exact"),
         (edit_feature(DEPTH, shape=None), r"as image \[36, 64, 1\], got image None"),

@@ -6,7 +6,7 @@ from __future__ import annotations
 import json
 import re
 import shutil
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import replace
 from hashlib import sha256
 from pathlib import Path
@@ -19,13 +19,25 @@ from PIL import Image
 from wiw.cli import main
 from wiw.datasets.navigation import NavigationData
 from wiw.datasets.navigation_check import verify_datasets
-from wiw.datasets.navigation_files import SEGMENTS, build_table, navigation_schema, write_frames, write_segment_list
+from wiw.datasets.navigation_files import (
+    SEGMENTS,
+    build_table,
+    describe_file,
+    navigation_schema,
+    write_frames,
+    write_segment_list,
+)
 from wiw.datasets.navigation_segment import NavigationSegment, encode_color
 from wiw.datasets.navigation_statistics import compute_statistics
+from wiw.datasets.worlds import world
 from wiw.errors import FileError
+from wiw.scenes import Scene, apartment
+from wiw.training import collect_navigation as collecting
+from wiw.training import navigation_estimate
 from wiw.training.collect_navigation import collect_navigation, describe_data
 from wiw.training.navigation_estimate import estimate_collection
-from wiw.training.navigation_recording import NavigationCollection
+from wiw.training.navigation_recording import NavigationCollection, record_segment
+from wiw.training.traversal import plan_scene
 from wiw.viz.navigation_maps import BARE, COVERED, PAPER, PIXELS_PER_METRE, draw_traversal, fill_floor, grow, join_loops
 
 pytest.importorskip("pyarrow", reason="needs wiw[export]")
@@ -203,6 +215,59 @@ def test_an_estimate_is_what_is_recorded(collected: Path, two_rooms: str) -> Non
     assert found.gigabytes == pytest.approx(pictures / 1e9, rel=0.2)
     assert estimate_collection(two_rooms, passes=3, **SMALL).frames == 3 * found.frames
     assert f"{found.frames:,} frames" in str(found) and "core hours" in str(found)
+
+
+def test_an_estimate_counts_scenes_passes_and_pictures_apart(
+    tmp_path: Path, two_rooms: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """By a clock that only opening, planning and recording move: an hour a scene, a tenth a pass, a hundredth each."""
+    hours, files = [0.0], [tmp_path / f"{number}" / "mesh.obj" for number in range(6)]
+    for file in files:
+        file.parent.mkdir()
+        shutil.copy(two_rooms, file)
+
+    def spend(time: float, function: Callable[..., Any]) -> Callable[..., Any]:
+        def spending(*given: Any) -> Any:
+            hours[0] += time
+            return function(*given)
+
+        return spending
+
+    monkeypatch.setattr(navigation_estimate, "_read_clock", lambda: 3600 * hours[0])
+    monkeypatch.setattr(navigation_estimate, "PLANNED_SCENES", 3)
+    monkeypatch.setattr(navigation_estimate, "RECORDED_SCENES", 2)
+    monkeypatch.setattr(navigation_estimate, "world", spend(1, world))
+    monkeypatch.setattr(navigation_estimate, "plan_scene", spend(0.1, plan_scene))
+    monkeypatch.setattr(collecting, "record_segment", spend(0.01, record_segment))
+    monkeypatch.setattr(collecting, "describe_file", spend(0.02, describe_file))
+    found = estimate_collection([str(file) for file in files], passes=4, **SMALL)
+    assert (found.scenes, found.planned_scenes) == (6, 3)
+    assert found.opening_hours == pytest.approx(6 * 1) and found.planning_hours == pytest.approx(6 * 4 * 0.1)
+    a_segment = found.pictures / found.recording_hours * 0.03
+    assert 1 < a_segment < found.pictures / found.segments * 3, "pictures in a sample that took 0.03 hours"
+    assert found.core_hours == found.opening_hours + found.planning_hours + found.recording_hours
+    assert "core hours on this machine: 6.0 to open scenes, 2.4 to plan, " in str(found)
+
+
+def test_an_estimate_counts_the_making_of_apartments_whatever_the_cache_has(monkeypatch: pytest.MonkeyPatch) -> None:
+    world("apartments:train/0", "cpu")
+    asked: list[bool] = []
+
+    def make(seed: int, split: str, cache: bool, edits: Sequence[str]) -> Scene:
+        asked.append(cache)
+        return apartment(seed, split, edits=edits)
+
+    monkeypatch.setattr(navigation_estimate, "_read_clock", lambda: 3600.0 * len(asked))
+    monkeypatch.setattr(navigation_estimate, "RECORDED_SCENES", 1)
+    monkeypatch.setattr(navigation_estimate, "apartment", make)
+    found = estimate_collection("apartments:train:2", **SMALL)
+    assert (found.opening_hours, found.planning_hours, found.recording_hours) == (2, 0, 0) and asked == [False]
+
+
+def test_a_scene_without_floor_is_estimated(two_rooms: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(navigation_estimate, "plan_scene", lambda *_: [])
+    found = estimate_collection(two_rooms, **SMALL)
+    assert (found.frames, found.pictures, found.coverage, found.gigabytes, found.recording_hours) == (0, 0, 0, 0, 0)
 
 
 SQUARE = [[0, 0, 4, 0], [4, 0, 4, 4], [4, 4, 0, 4], [0, 4, 0, 0]]

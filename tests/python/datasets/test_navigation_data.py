@@ -5,6 +5,7 @@ from __future__ import annotations
 
 import json
 import os
+import re
 import shutil
 import signal
 import subprocess
@@ -25,6 +26,12 @@ from wiw.action import FORWARD, NULL, STOP, TURN_LEFT, TURN_RIGHT, to_trajectory
 from wiw.datasets.navigation import NavigationData, part_of
 from wiw.datasets.navigation_files import COLUMNS, FrameFile, build_table, navigation_schema, write_frames
 from wiw.datasets.navigation_segment import DEPTH_UNITS, NavigationSegment, encode_color, encode_millimetres
+from wiw.datasets.scene_splits import (
+    find_evaluation_split,
+    find_shared_scene,
+    list_evaluation_scenes,
+    match_names,
+)
 from wiw.datasets.worlds import world
 from wiw.errors import ArgumentError, DependencyError, FileError, InfrastructureError
 from wiw.training import collect_navigation as collecting
@@ -423,8 +430,6 @@ def test_files_below_a_folder_of_evaluation_are_refused(tmp_path: Path, two_room
         file.write_bytes(b"")
         with pytest.raises(ArgumentError, match=f"which is of {split}"):
             resolve_train_scenes(file)
-    with pytest.raises(ArgumentError, match="two_rooms twice"):
-        resolve_train_scenes([two_rooms, two_rooms])
     with pytest.raises(ArgumentError, match="got none"):
         resolve_train_scenes([])
     assert list(resolve_train_scenes([two_rooms, "apartments:train:2"])) == [
@@ -432,6 +437,109 @@ def test_files_below_a_folder_of_evaluation_are_refused(tmp_path: Path, two_room
         "apartments:train/0",
         "apartments:train/1",
     ]
+
+
+@pytest.mark.parametrize(
+    ("file", "split"),
+    [
+        ("hm3d-val-habitat-v0.2/a/b.glb", "val"),
+        ("hm3d-minival-habitat/a/b.glb", "minival"),
+        ("HM3D-test-glb-v0.2/a/b.glb", "test"),
+        ("hm3d_val/a/b.glb", "val"),
+        ("hm3d/00800-TEEsavR23oF/TEEsavR23oF.basis.glb", "val"),
+        ("hm3d/00877-4ok3usBNeis/4ok3usBNeis.glb", "val"),
+        ("hm3d/00900-4ok3usBNeis/4ok3usBNeis.basis.glb", "test"),
+        ("hm3d-train-habitat-v0.2/00999-4ok3usBNeis/4ok3usBNeis.basis.glb", "test"),
+        ("hm3d-train-habitat-v0.2/00799-4ok3usBNeis/4ok3usBNeis.basis.glb", None),
+        ("hm3d/01000-4ok3usBNeis/4ok3usBNeis.basis.glb", None),
+        ("hm3d/00877-4ok3usBNeis/kitchen.glb", None),
+        ("mine/00877-kitchen/kitchen.glb", None),
+        ("mine/877-4ok3usBNeis/4ok3usBNeis.glb", None),
+        ("00877-4ok3usBNeis/more/4ok3usBNeis.glb", None),
+        ("hm3d-valley/a.glb", None),
+        ("hm3d-test-run-7/a.glb", None),
+        ("evaluate/latest/testing.glb", None),
+    ],
+)
+def test_scans_of_evaluation_are_known_by_their_archives_and_numbers(file: str, split: str | None) -> None:
+    assert find_evaluation_split(f"/data/{file}") == split
+
+
+def write_scenes(folder: Path, *names: str) -> list[str]:
+    """Write empty files; return their paths."""
+    for name in names:
+        (folder / name).parent.mkdir(parents=True, exist_ok=True)
+        (folder / name).touch()
+    return [str(folder / name) for name in names]
+
+
+@pytest.mark.parametrize(
+    ("files", "names"),
+    [
+        (["a/mesh.obj", "b/mesh.obj", "c/other.v1.obj"], ["a/mesh", "b/mesh", "other"]),
+        (["house.v1.glb", "house.v2.glb"], ["house.v1", "house.v2"]),
+        (["house.glb", "house.v2.glb"], ["house", "house.v2"]),
+        (["a/x.v1.glb", "a/x.v2.glb", "b/x.v1.glb"], ["a/x.v1", "a/x.v2", "b/x.v1"]),
+        (["p/a/mesh.obj", "q/a/mesh.obj"], ["p/a/mesh", "q/a/mesh"]),
+        (["a/scan.basis.glb", "b/scan.basis.glb"], ["a/scan", "b/scan"]),
+        (["a/home.scene_instance.json", "b/home.scene_instance.json"], ["a/home", "b/home"]),
+        (["p/r/habitat/mesh_semantic.ply", "q/r/habitat/mesh_semantic.ply"], ["p/r", "q/r"]),
+        (["scan.basis.glb", "house.v1.glb", "r/habitat/mesh_semantic.ply"], ["scan", "house", "r"]),
+    ],
+)
+def test_scenes_of_one_name_are_told_apart_by_their_paths(
+    files: list[str], names: list[str], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    specs = write_scenes(tmp_path, *files)
+    assert list(resolve_train_scenes(specs).items()) == list(zip(names, specs, strict=True))
+    assert list(resolve_train_scenes(specs[::-1])) == names[::-1]
+    monkeypatch.chdir(tmp_path)
+    assert list(resolve_train_scenes(files)) == names
+    for spec in specs:
+        assert find_shared_scene([spec], names) == spec, "a scene is known by the name that it has among others"
+    assert find_shared_scene(write_scenes(tmp_path, "elsewhere/new.glb"), names) is None
+    if names[0] in ("a/mesh", "a/scan", "a/home"):
+        assert find_shared_scene([specs[0].replace("/a/", "/c/")], names) is None
+
+
+def test_a_scene_is_not_collected_twice(tmp_path: Path) -> None:
+    one, other, twin = write_scenes(tmp_path, "a/house.glb", "a/house.obj", "r.v1/habitat/mesh_semantic.ply")
+    (tmp_path / "linked").symlink_to("a")
+    again = [one, f"{tmp_path}/b/../a/house.glb", f"{tmp_path}/linked/house.glb", other]
+    (third,) = write_scenes(tmp_path, "b/house.glb")
+    for second in again:
+        with pytest.raises(ArgumentError, match=rf"got house twice \({one}, {re.escape(second)}\): .*rename one"):
+            resolve_train_scenes([third, one, second])
+    with pytest.raises(ArgumentError, match="apartments:train/0 twice"):
+        resolve_train_scenes(["apartments:train:1", "apartments:train/0"])
+    with pytest.raises(ArgumentError, match=r"r\.v1 twice"):
+        resolve_train_scenes([*write_scenes(tmp_path, "r.v1.glb", "r.v2.glb"), twin])
+
+
+def test_names_of_two_datasets_match_if_they_may_be_of_one_scene() -> None:
+    first, second = (
+        ["mesh", "p/a/house.v1", "apartments:train/0"],
+        ["b/mesh", "a/house.v1", "0", "c/house.v1", "train/0"],
+    )
+    assert match_names(first, second) == [("mesh", "b/mesh"), ("p/a/house.v1", "a/house.v1")]
+    assert match_names(second, first) == sorted((b, a) for a, b in match_names(first, second))
+    assert match_names(["house"], ["house.v2", "a/b"]) == [("house", "house.v2")]
+    assert list_evaluation_scenes(["x/2azQ1b91cZZ", "x/mesh"]) == [("x/2azQ1b91cZZ", "val")]
+
+
+def test_scenes_of_one_file_name_are_recorded(two_rooms: str, tmp_path: Path) -> None:
+    files = [tmp_path / folder / "mesh.obj" for folder in "ab"]
+    for file in files:
+        file.parent.mkdir()
+        shutil.copy(two_rooms, file)
+    few = {**SMALL, "rules": {**RULES, "max_scene_frames": 10}}
+    data = collect_navigation(tmp_path / "out", files, **few)
+    assert data.scenes == {"a/mesh", "b/mesh"} and data.find_shared([str(files[1])]) == str(files[1])
+    before = contents(tmp_path / "out")
+    collect_navigation(tmp_path / "out", files, **few)
+    assert contents(tmp_path / "out") == before
+    with pytest.raises(ArgumentError, match="holds a different collection"):
+        collect_navigation(tmp_path / "out", files[:1], **few)
 
 
 @pytest.mark.parametrize(

@@ -24,7 +24,7 @@ pytest.importorskip("pyarrow", reason="no pyarrow: pip install 'wiw[export]'")
 
 import torch
 from post_training_parts import make_trainer, save_dataset, save_stock, tiny_recipe, with_nightly
-from safetensors.torch import load_file
+from safetensors.torch import load_file, save
 
 import tiny_pipelines
 from wiw.cli import main
@@ -35,6 +35,7 @@ from wiw.training.post_training.encode_clips import ClipEncoder, _list_rows, cho
 from wiw.training.post_training.families import NWMFamily, PretrainedWeights, find_family
 from wiw.training.post_training.latent_cache import LatentCache
 from wiw.training.post_training.train import list_remedies, open_cache, post_train
+from wiw.training.post_training.trainable import Encoded
 from wiw.training.post_training.trainer import PostTrainer
 
 pytestmark = pytest.mark.usefixtures("one_torch_thread")
@@ -240,6 +241,35 @@ def test_a_damaged_file_of_the_cache_is_made_anew(data: Path, weights: Any, tmp_
         plain.train_step(1e-3)
         cached.train_step(1e-3)
     require_equal(plain, cached)
+
+
+@pytest.mark.parametrize(
+    "kept", [torch.arange(6.0).reshape(2, 3), torch.ones(4, dtype=torch.bfloat16), torch.tensor(3)]
+)
+def test_a_flipped_bit_of_the_cache_is_noticed(kept: torch.Tensor, tmp_path: Path) -> None:
+    """Flipped in every byte of a file, one after the other: tensors, types, shapes, names and checksum."""
+    cache, actions = LatentCache(tmp_path, {}), torch.arange(4, dtype=torch.int8)
+    encodings: list[int] = []
+
+    def make() -> tuple[Encoded, torch.Tensor]:
+        encodings.append(7)
+        return {"latents": kept}, actions
+
+    def read() -> tuple[Encoded, torch.Tensor]:
+        return cache.encode(7, False, make, torch.device("cpu"))
+
+    read()
+    (path,) = tmp_path.rglob("*.safetensors")
+    whole = path.read_bytes()
+    for at in range(len(whole)):
+        path.write_bytes(whole[:at] + bytes([whole[at] ^ 1]) + whole[at + 1 :])
+        found, read_actions = read()
+        assert list(found) == ["latents"] and torch.equal(found["latents"], kept) and torch.equal(read_actions, actions)
+        assert path.read_bytes() == whole and len(encodings) == at + 2
+    path.write_bytes(save({"latents": kept, "actions": actions}))
+    for _ in range(3):
+        read()
+    assert len(encodings) == len(whole) + 2, "a file without a checksum is made anew, once"
 
 
 def test_trainings_share_a_cache_unless_latents_differ(data: Path, weights: Any, tmp_path: Path) -> None:

@@ -3,20 +3,29 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Iterator, Mapping, Sequence
 from itertools import accumulate, groupby
 from pathlib import Path, PurePosixPath
+from string import Formatter
 from typing import Any
 
 import numpy as np
 
-from wiw.datasets.lerobot.layout import INDICES, INFO, SOURCE, VERSION, Episode, Feature
+from wiw.datasets.lerobot.layout import DATA, INDICES, INFO, SOURCE, VERSION, Episode, Feature
 from wiw.errors import FileError
 from wiw.mapping_files import read_json_object
 
-EPISODE_COLUMNS = ("tasks", "length", "data/chunk_index", "data/file_index", "dataset_from_index", "dataset_to_index")
+EPISODE_NUMBERS = ("length", "data/chunk_index", "data/file_index", "dataset_from_index", "dataset_to_index")
+EPISODE_COLUMNS = ("tasks", *EPISODE_NUMBERS)
 TIME_TOLERANCE = 1e-4
 """Seconds: LeRobot's own."""
+MOST_FPS = 10**9
+"""Most frames per second; a number of JSON may be too large to divide by."""
+PLACE = ("chunk_index", "file_index")
+"""Fields of `data_path` in `meta/info.json`."""
+NUMBER_FORMAT = re.compile("(?:0?[1-9])?d?")
+"""How such a field may be written: as whole numbers of up to nine digits. A larger width would fill the memory."""
 
 
 class LeRobotFolder:
@@ -116,16 +125,18 @@ class LeRobotFolder:
 
     def _locate(self, row: Mapping[str, Any]) -> str:
         """Return the name of the file that has an episode."""
+        numbers = {name: row[f"data/{name}"] for name in PLACE}
+        template = self.info.get("data_path")
         try:
-            name: str = self.info["data_path"].format(
-                chunk_index=row["data/chunk_index"], file_index=row["data/file_index"]
-            )
-            return name
-        except (KeyError, IndexError, AttributeError, ValueError) as error:
+            name = _fill(template, numbers) if isinstance(template, str) else ""
+        except ValueError:  # braces that do not match
+            name = ""
+        if not _is_inside(name):
             raise FileError(
-                f"{self.folder / INFO}: expected a data_path of chunk_index and file_index, got "
-                f"{self.info.get('data_path')}"
-            ) from error
+                f"{self.folder / INFO}: expected a data_path of chunk_index and file_index within the dataset, such as "
+                f"{DATA}, got {str(template)[:200]}"
+            )
+        return name
 
     def _read_episode_rows(self) -> list[dict[str, Any]]:
         """Return the rows of `meta/episodes` without statistics."""
@@ -146,22 +157,27 @@ class LeRobotFolder:
             )
         if missing := [name for name in EPISODE_COLUMNS if name not in rows[0]]:
             raise FileError(f"{folder}: expected columns {', '.join(EPISODE_COLUMNS)}, got no {', '.join(missing)}")
+        for name in EPISODE_NUMBERS:
+            if odd := [row[name] for row in rows if type(row[name]) is not int or row[name] < 0]:
+                raise FileError(f"{folder}: expected whole numbers from 0 as {name}, got {str(odd[0])[:200]}")
         return rows
 
     def _check_frames(self, row: Mapping[str, Any], table: Any, path: Path) -> None:
         """Compare the numbers of frames with what `meta` says."""
         frames = table.column("frame_index").to_numpy()
         index = table.column("index").to_numpy()
-        expected = np.arange(row["length"])
-        if not (np.array_equal(frames, expected) and np.array_equal(index, expected + row["dataset_from_index"])):
+        expected = np.arange(len(frames))
+        right = len(frames) == row["length"] and np.array_equal(frames, expected)
+        if not (right and np.array_equal(index, expected + row["dataset_from_index"])):
             raise FileError(
                 f"{path}: expected frames {row['dataset_from_index']} to {row['dataset_to_index'] - 1} of episode "
                 f"{row['episode_index']}, got others"
             )
         times = table.column("timestamp").to_numpy()
         fps = self.info.get("fps")
-        if not isinstance(fps, int | float) or fps <= 0 or (np.abs(times - expected / fps) > TIME_TOLERANCE).any():
-            rate = f"{(len(times) - 1) / times[-1]:g}" if times[-1] > 0 else "no"
+        known = isinstance(fps, int | float) and 0 < fps <= MOST_FPS
+        if not known or (np.abs(times - expected / fps) > TIME_TOLERANCE).any():
+            rate = f"{(len(times) - 1) / times[-1]:g}" if len(times) and times[-1] > 0 else "no"
             raise FileError(
                 f"{path}, episode {row['episode_index']}: expected {fps} frames per second as {INFO} says, got "
                 f"timestamps of {rate}"
@@ -216,13 +232,33 @@ def _read_column(column: Any, feature: Feature) -> Any:
     return column.combine_chunks().flatten().to_numpy(zero_copy_only=False).reshape(-1, *feature.shape)
 
 
+def _fill(template: str, numbers: Mapping[str, int]) -> str:
+    """Return a template with its fields filled in; "" where it has others, or writes them other than as numbers."""
+    filled = ""
+    for text, name, how, conversion in Formatter().parse(template):
+        filled += text
+        if name is None:
+            continue
+        if name not in numbers or conversion or not NUMBER_FORMAT.fullmatch(how or ""):
+            return ""
+        filled += format(numbers[name], how or "")
+    return filled
+
+
 def check_file_name(name: str) -> str:
     """Return the name of a file within the folder that is written, which a dataset gives.
 
     Raises:
         FileError: it leads elsewhere.
     """
-    path = PurePosixPath(name)
-    if not name.endswith(".parquet") or ".." in path.parts or path.is_absolute():
+    if not _is_inside(name):
         raise FileError(f"meta/episodes: expected file as the name of a Parquet file in the new folder, got {name}")
     return name
+
+
+def _is_inside(name: object) -> bool:
+    """Return whether a name is that of a Parquet file below the folder that it is relative to."""
+    if not isinstance(name, str) or not name.endswith(".parquet") or not name.isprintable():
+        return False
+    path = PurePosixPath(name)
+    return ".." not in path.parts and not path.is_absolute()

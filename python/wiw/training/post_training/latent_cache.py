@@ -5,6 +5,7 @@ from __future__ import annotations
 
 import hashlib
 import json
+import zlib
 from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any
@@ -19,6 +20,8 @@ from wiw.training.post_training.trainable import Encoded
 
 ACTIONS = "actions"
 """Name under which a clip's actions lie beside its latents."""
+CHECKSUM = "crc32"
+"""Entry of a file's metadata: the CRC-32 of its tensors with their names, types and shapes, which safetensors lacks."""
 FILES = 1000
 """Clips in a folder."""
 
@@ -42,6 +45,8 @@ class LatentCache:
     ) -> tuple[Encoded, Tensor]:
         """Return a clip's latents and actions: those on disk, or what `make` returns, which is then written.
 
+        Files that are damaged, by their checksum, are replaced.
+
         Raises:
             FileError: they cannot be written.
         """
@@ -51,15 +56,28 @@ class LatentCache:
             encoded, actions = make()
             found = {name: value.contiguous().cpu() for name, value in {**encoded, ACTIONS: actions}.items()}
             with atomic_file(path) as draft:
-                draft.write_bytes(save(found))
+                draft.write_bytes(save(found, {CHECKSUM: compute_checksum(found)}))
         moved = {name: value.to(device) for name, value in found.items()}
         actions = moved.pop(ACTIONS)
         return moved, actions
 
 
+def compute_checksum(tensors: Mapping[str, Tensor]) -> str:
+    """Return the CRC-32 of tensors on the CPU with their names, types and shapes, as eight hexadecimal digits."""
+    found = 0
+    for name, value in sorted(tensors.items()):
+        found = zlib.crc32(f"{name} {value.dtype} {list(value.shape)}".encode(), found)
+        found = zlib.crc32(value.detach().reshape(-1).view(torch.uint8).numpy().data, found)
+    return f"{found:08x}"
+
+
 def _read(path: Path) -> dict[str, Tensor] | None:
-    """Return a file's tensors; None if it is missing or damaged, and has to be made anew."""
+    """Return a file's tensors; None if it is missing, damaged or without a checksum, and has to be made anew."""
     try:
-        return load(path.read_bytes())
-    except (FileNotFoundError, SafetensorError):
+        data = path.read_bytes()
+        tensors = load(data)
+    except (FileNotFoundError, SafetensorError, KeyError):  # a damaged header may name a type that torch has not
         return None
+    header = json.loads(data[8 : 8 + int.from_bytes(data[:8], "little")])
+    expected = (header.get("__metadata__") or {}).get(CHECKSUM)
+    return tensors if expected == compute_checksum(tensors) else None

@@ -16,9 +16,9 @@ from numpy.typing import NDArray
 
 from wiw.datasets.decisions import Decisions, digest_decisions, load_decisions, read_scenes
 from wiw.datasets.navigation import Part
+from wiw.datasets.scene_splits import find_shared_scene
 from wiw.errors import ArgumentError
 from wiw.files import atomic_file
-from wiw.scenes import strip_edits
 from wiw.training.checkpoint import ResumableTrainer
 from wiw.training.decision_errors import measure_decisions
 from wiw.training.held_out_clips import Frames, HeldOutClips, Imagine, ShownView, measure_clips
@@ -135,19 +135,19 @@ def _require_none(validation: str | Path | None, decisions: str | Path | None, w
 
 
 def _require_unseen_decisions(decisions: str | Path | None, trained: AbstractSet[str]) -> None:
-    """Check that no stored decision is made in a scene that is trained on.
+    """Check that no stored decision is made in a scene that is trained on, as far as its name tells.
 
     Raises:
-        ArgumentError: names such scenes.
+        ArgumentError: names such a scene.
         FileError: the file is damaged.
     """
     if decisions is None:
         return
-    seen = sorted(trained & set(map(strip_edits, read_scenes(decisions))))
-    if seen:
+    seen = find_shared_scene(read_scenes(decisions), trained)
+    if seen is not None:
         raise ArgumentError(
-            f"decisions: expected scenes that are not trained on, got {', '.join(seen[:3])}; collect decisions "
-            "in others, such as apartments:val:40"
+            f"decisions: expected scenes that are not trained on, got {seen}; collect decisions in others, such as "
+            "apartments:val:40"
         )
 
 
