@@ -175,8 +175,11 @@ class LeRobotFolder:
             )
         times = table.column("timestamp").to_numpy()
         fps = self.info.get("fps")
-        known = isinstance(fps, int | float) and 0 < fps <= MOST_FPS
-        if not known or (np.abs(times - expected / fps) > TIME_TOLERANCE).any():
+        if not (
+            isinstance(fps, int | float)
+            and 0 < fps <= MOST_FPS
+            and (np.abs(times - expected / fps) <= TIME_TOLERANCE).all()
+        ):
             rate = f"{(len(times) - 1) / times[-1]:g}" if len(times) and times[-1] > 0 else "no"
             raise FileError(
                 f"{path}, episode {row['episode_index']}: expected {fps} frames per second as {INFO} says, got "
