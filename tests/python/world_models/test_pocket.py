@@ -14,13 +14,16 @@ import cv2
 import numpy as np
 import pytest
 
+import wiw
 from wiw.action import FORWARD, TURN_LEFT, TURN_RIGHT, to_trajectory
+from wiw.datasets.cameras import camera_pose
+from wiw.datasets.worlds import world
 from wiw.errors import ArgumentError, WeightsError
 from wiw.types import Conditioning, Control
 
 torch = pytest.importorskip("torch", reason="needs wiw[torch]")
 
-from wiw.world_models.pocket.model import Pocket, find_places  # noqa: E402
+from wiw.world_models.pocket.model import BUILT_IN, Pocket, find_places  # noqa: E402
 from wiw.world_models.pocket.network import RADII, Denoiser, Estimate, Views, map_displacements  # noqa: E402
 from wiw.world_models.pocket.sampler import draw_noise, sample_views  # noqa: E402
 from wiw.world_models.pocket.weights import load, save  # noqa: E402
@@ -253,3 +256,39 @@ def test_a_smaller_size_shows_the_same_and_is_part_of_its_identity() -> None:
 def test_a_size_below_the_networks_is_refused(size: Any) -> None:
     with pytest.raises(ArgumentError, match=r"pocket: expected a size \(height, width\) of at least"):
         Pocket(size=size)
+
+
+# -- as it comes with wiw ----------------------------------------------------------------------------------------------
+
+
+def test_the_weights_that_come_with_it_beat_the_floor_and_obey(two_rooms: str) -> None:
+    """In a bare room unlike any apartment."""
+    poses = np.stack([camera_pose(np.array([-2.4, 0, z]), 0.0) for z in (1.4, 0.8)])
+    before, after = world(two_rooms).renderer.panorama(poses, outputs=("color",))["color"]
+    places = {"true": [0.6, 0.0, 0.0], "false": [-0.6, 0.0, 0.0]}
+    model = wiw.world_model("pocket")
+    made = {name: model.imagine_trajectory(before, np.array([place]), 0)[0] for name, place in places.items()}
+    psnr = {name: wiw.metrics.psnr(frame, after, weights="latitude") for name, frame in made.items()}
+    assert psnr["true"] > wiw.metrics.psnr(before, after, weights="latitude") + 1.5
+    assert psnr["true"] > psnr["false"] + 3
+    assert BUILT_IN.stat().st_size < 10 * 2**20
+
+
+def test_its_card_has_the_recipe_and_what_it_is_worth() -> None:
+    card = Pocket().card
+    for kind in ("mixed", "straight"):
+        psnr = card["held_out"][kind]["psnr"]
+        assert set(psnr) == {"copy", "rolled", "one room", "pocket"}
+        assert all(psnr["pocket"][step] > psnr["copy"][step] + 5 for step in ("1", "3", "5", "8"))
+    gap = card["held_out"]["mixed"]["gap"]
+    assert set(gap) == {"1", "3", "5", "8"} and np.mean(list(gap.values())) > 3
+    assert card["val"].startswith("apartments:val") and card["data"]["part"] == "train"
+    assert card["trained_steps"] == 8733 and card["recipe"]["epochs"] == 1
+
+
+def test_the_readme_tells_the_gap_of_the_card() -> None:
+    card = Pocket().card
+    gap = [f"{value:.1f}" for value in card["held_out"]["mixed"]["gap"].values()]
+    told = " ".join((BUILT_IN.parent / "README.md").read_text().split())
+    assert f"they lose {gap[0]}, {gap[1]}, {gap[2]} and {gap[3]} dB after 1, 3, 5 and 8 primitives" in told
+    assert f"`{card['val']}`" in told
