@@ -25,6 +25,12 @@ inline std::string shape_text(const py::array& array) {
   return text + "] " + std::string(py::str(array.dtype()));
 }
 
+/// What was given in the place of an array: shape and dtype, or the type of what is none.
+inline std::string given_text(const py::handle& value) {
+  if (py::isinstance<py::array>(value)) return shape_text(py::reinterpret_borrow<py::array>(value));
+  return py::str(py::type::of(value));
+}
+
 /// Throws ArgumentError unless the shape matches; -1 matches any length.
 inline void expect_shape(const py::array& array, std::initializer_list<py::ssize_t> shape, const char* expected) {
   bool fits = array.ndim() == static_cast<py::ssize_t>(shape.size());

@@ -400,7 +400,8 @@ void bind_queries(py::class_<NavMesh, std::shared_ptr<NavMesh>>& mesh) {
            py::arg("return_reason") = false,
            "Length in metres of the shortest way between `a` and `b` (float [N, 3] or [3] each; one may be a single "
            "point): float64 [N] or float, inf where there is none. With return_reason also why: '' or 'start off "
-           "mesh', 'end off mesh', 'other island', or for metric='detour' its search limit.");
+           "mesh', 'end off mesh', 'other island', 'disconnected mesh' (a damaged file), or for metric='detour' "
+           "its search limit.");
   mesh.def("distance_matrix", &distance_matrix, py::arg("points"), py::arg("metric") = "exact",
            "float64 [N, N]: length in metres of the shortest way between any two of `points` (float [N, 3]), inf where "
            "there is none. Far faster than asking for each pair.");
@@ -420,7 +421,8 @@ void bind_fields(py::module_& module, py::class_<NavMesh, std::shared_ptr<NavMes
       .def(
           "__call__", &field_distance, py::arg("points"), py::arg("return_reason") = false,
           "float64 [N] metres from `points` (float [N, 3] or [3]) to the nearest goal, inf where there is no way; with "
-          "return_reason also why: '', 'start off mesh' or 'other island'.");
+          "return_reason also why: '', 'start off mesh', 'other island' or 'disconnected mesh' (a damaged "
+          "file).");
   mesh.def(
       "distances_from",
       [](const std::shared_ptr<NavMesh>& self, const Array<float>& array) {

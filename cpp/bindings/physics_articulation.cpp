@@ -150,9 +150,11 @@ fixed, revolute, continuous or prismatic; the motor of a joint with `mimic` foll
 and friction are not read: motors set velocities. Link 0 is the base. Immutable; may be
 shared between worlds and threads.)")
       .def(py::init([](const std::filesystem::path& path) {
+             // A guard of the whole call would go on while pybind11 registers the object, which takes the lock.
+             const wiw::bindings::GilRelease release;
              return std::const_pointer_cast<Articulation>(Articulation::load(path));
            }),
-           py::arg("path"), py::call_guard<wiw::bindings::GilRelease>(),
+           py::arg("path"),
            "Reads a URDF file. FileError for a file or mesh that is missing or damaged (the message names the link), "
            "ArgumentError for impossible numbers and other joints. `package://NAME/...` is looked for in the folders "
            "above the file. It is read in this process; `wiw.tabletop.robot.robot_of` reads files of others in one of "
@@ -171,7 +173,8 @@ shared between worlds and threads.)")
           [](const py::dict& parts) {
             return std::const_pointer_cast<Articulation>(bindings::articulation_from_parts(parts));
           },
-          py::arg("parts"), "The articulation whose `to_parts` this is. ArgumentError for parts that fit no tree.")
+          py::arg("parts"),
+          "The articulation whose `to_parts` this is. ArgumentError for parts that fit no tree and impossible numbers.")
       .def_property_readonly("name", &Articulation::name)
       .def_property_readonly("links", &link_names, "Names, parents before their children.")
       .def_property_readonly("joints", &Articulation::movable_joints, "Names of the movable joints.")

@@ -44,6 +44,7 @@ int add_body(World& world, const py::object& shape, double mass, const Array<dou
     body.parts.push_back(to_part(shape));
   }
   body.T_world_body = to_pose(pose, "T_world_body");
+  const bindings::GilRelease release;
   return world.add_body(body);
 }
 
@@ -164,7 +165,9 @@ void bind_articulated(py::class_<World>& world) {
   world.def(
       "add_articulation",
       [](World& self, const ArticulationPtr& articulation, const Array<double>& pose) {
-        return self.add_articulation(articulation, to_pose(pose, "T_world_base"));
+        const Pose base = to_pose(pose, "T_world_base");
+        const bindings::GilRelease release;
+        return self.add_articulation(articulation, base);
       },
       py::arg("articulation").none(false), py::arg("T_world_base") = pose_array(Pose::Identity()),
       "Adds an Articulation on a fixed base and returns its index, from 0. Its joints start at the positions nearest "
@@ -175,7 +178,9 @@ void bind_articulated(py::class_<World>& world) {
   world.def("joint_targets", &World::joint_targets, first, "float64 [dof]: where the motors go.");
   world.def("joint_forces", &World::joint_forces, first, "float64 [dof]: what the motors may exert, Nm or N.");
   world.def("set_joint_positions", swapped<&World::set_joint_positions>, py::arg("positions"), first,
-            "Puts the joints somewhere within their limits, at rest, with their targets there.");
+            "Puts the joints somewhere within their limits, at rest, with their targets there. Held bodies stay where "
+            "they are, and the next steps would pull them to the link: detach them before, or put them where they "
+            "belong after.");
   world.def("set_joint_velocities", swapped<&World::set_joint_velocities>, py::arg("velocities"), first);
   world.def(
       "set_joint_targets", swapped<&World::set_joint_targets>, py::arg("targets"), first,

@@ -4,10 +4,12 @@
 #include <pybind11/stl.h>
 #include <pybind11/stl/filesystem.h>
 
+#include <cmath>
 #include <string>
 #include <vector>
 
 #include "wiw/core/error.hpp"
+#include "wiw/physics/articulation_check.hpp"
 
 namespace py = pybind11;
 using namespace wiw;
@@ -16,6 +18,8 @@ using namespace wiw::physics;
 namespace {
 
 using Numbers = std::vector<double>;
+
+const std::string kParts = "parts of an articulation";
 
 template <class Matrix>
 Numbers numbers_of(const Matrix& matrix) {
@@ -28,7 +32,7 @@ Matrix matrix_of(const py::handle& value) {
   Matrix matrix;
   if constexpr (Matrix::SizeAtCompileTime == Eigen::Dynamic) matrix.resize(static_cast<Eigen::Index>(numbers.size()));
   if (numbers.size() != static_cast<std::size_t>(matrix.size())) {
-    throw ArgumentError("parts of an articulation: expected " + std::to_string(matrix.size()) + " numbers, got " +
+    throw ArgumentError(kParts + ": expected " + std::to_string(matrix.size()) + " numbers, got " +
                         std::to_string(numbers.size()));
   }
   std::copy(numbers.begin(), numbers.end(), matrix.data());
@@ -118,9 +122,10 @@ Link link_of(const py::dict& parts) {
   link.inertial.mass = parts["mass"].cast<double>();
   link.inertial.center = matrix_of<Eigen::Vector3d>(parts["center"]);
   link.inertial.inertia = matrix_of<Eigen::Matrix3d>(parts["inertia"]);
+  check_inertial(link.inertial, kParts + ": link '" + link.name + "'");
   for (const py::handle each : parts["collision"]) {
     link.collision.push_back({shape_of(each.cast<py::dict>()), pose_of(each["pose"])});
-    check_part(link.collision.back(), "link '" + link.name + "'");
+    check_part(link.collision.back(), kParts + ": link '" + link.name + "'");
   }
   for (const py::handle each : parts["visual"]) link.visual.push_back(visual_of(each.cast<py::dict>()));
   return link;
@@ -169,10 +174,39 @@ void check_tree(const std::vector<Link>& links, const std::vector<Joint>& joints
     const bool is_fixed = joint.type == JointType::kFixed;
     fits = fits && joint.parent >= 0 && joint.parent <= static_cast<int>(i);
     fits = fits && (is_fixed ? joint.index == -1 : joint.index == next++);
-    fits = fits && (!joint.mimic || (joint.mimic->index >= 0 && joint.mimic->index < dof));
     fits = fits && joint.type >= JointType::kFixed && joint.type <= JointType::kPrismatic;
   }
-  if (!fits || next != dof) throw ArgumentError("parts of an articulation: links, joints and limits make no tree");
+  if (!fits || next != dof) throw ArgumentError(kParts + ": links, joints and limits make no tree");
+}
+
+/// Of a tree: what the URDF reader asks of movable joints.
+void check_joints(const std::vector<Joint>& joints, const JointLimits& limits) {
+  std::vector<const Joint*> movable;
+  for (const Joint& joint : joints) {
+    if (joint.index >= 0) movable.push_back(&joint);
+  }
+  for (const Joint& joint : joints) {
+    const std::string which = "joint '" + joint.name + "'";
+    if (joint.mimic) {
+      const auto [leader, multiplier, offset] = *joint.mimic;
+      const bool leads = leader >= 0 && static_cast<std::size_t>(leader) < movable.size() &&
+                         !movable[static_cast<std::size_t>(leader)]->mimic;
+      if (joint.index < 0 || !leads || !std::isfinite(multiplier) || !std::isfinite(offset)) {
+        throw ArgumentError(kParts + ": " + which + " mimics joint " + std::to_string(leader) + " of " +
+                            std::to_string(movable.size()) +
+                            "; expected two movable joints, of which the other mimics none, a finite multiplier and "
+                            "offset");
+      }
+    }
+    if (joint.index < 0) continue;
+    if (!joint.axis.allFinite() || std::abs(joint.axis.norm() - 1) > 1e-6) {
+      throw ArgumentError(kParts + ": expected the axis of " + which + " to have length 1, got " +
+                          std::to_string(joint.axis.norm()));
+    }
+    check_range({limits.lower[joint.index], limits.upper[joint.index], limits.velocity[joint.index],
+                 limits.effort[joint.index]},
+                kParts + ": the limits of " + which);
+  }
 }
 
 }  // namespace
@@ -204,6 +238,7 @@ ArticulationPtr read_parts(const py::dict& parts) {
   JointLimits limits{matrix_of<Eigen::VectorXd>(rows[0]), matrix_of<Eigen::VectorXd>(rows[1]),
                      matrix_of<Eigen::VectorXd>(rows[2]), matrix_of<Eigen::VectorXd>(rows[3])};
   check_tree(links, joints, limits);
+  check_joints(joints, limits);
   return std::make_shared<Articulation>(parts["name"].cast<std::string>(), std::move(links), std::move(joints),
                                         std::move(limits));
 }
@@ -211,7 +246,7 @@ ArticulationPtr read_parts(const py::dict& parts) {
 }  // namespace
 
 ArticulationPtr articulation_from_parts(const py::dict& parts) {
-  const std::string expected = "parts of an articulation: expected what `to_parts` gives; ";
+  const std::string expected = kParts + ": expected what `to_parts` gives; ";
   try {
     return read_parts(parts);
   } catch (const py::error_already_set& error) {  // a key or an element that is missing

@@ -107,7 +107,7 @@ EpisodeArrays<T> to_episode_images(const py::iterable& items, py::ssize_t channe
   EpisodeArrays<T> episodes;
   for (const py::handle& item : items) {
     if (!py::isinstance<py::array_t<T>>(item)) {
-      throw ArgumentError("expected " + expected + ", got " + std::string(py::str(py::type::of(item))));
+      throw ArgumentError("expected " + expected + ", got an episode's " + given_text(item));
     }
     const Array<T> array(py::reinterpret_borrow<py::object>(item));  // copied only where it is not dense
     const Size size = image_size(array, channels, expected);
@@ -142,7 +142,7 @@ Answers to_answers(const py::sequence& rollouts, const std::string& frames) {
   for (const py::handle& item : rollouts) {
     auto array = py::reinterpret_borrow<py::array>(item);
     if (!py::isinstance<py::array_t<std::uint8_t>>(item)) {
-      throw ArgumentError(std::string("expected ") + kExpected + ", got " + std::string(py::str(py::type::of(item))));
+      throw ArgumentError(std::string("expected ") + kExpected + ", got " + given_text(item));
     }
     expect_shape(array, {-1, -1, -1, -1, 3}, kExpected);
     if (!has_dense_images(array)) array = Bytes(array);

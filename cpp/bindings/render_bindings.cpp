@@ -28,9 +28,7 @@ template <class T>
 T* target(const py::object& array, std::initializer_list<py::ssize_t> shape, const char* expected) {
   if (array.is_none()) return nullptr;
   if (!py::isinstance<py::array_t<T>>(array)) {
-    throw wiw::ArgumentError(std::string("render: expected ") + expected + ", got " +
-                             std::string(py::str(py::type::of(array))) +
-                             (py::isinstance<py::array>(array) ? " of another dtype" : ""));
+    throw wiw::ArgumentError(std::string("render: expected ") + expected + ", got " + wiw::bindings::given_text(array));
   }
   auto typed = py::reinterpret_borrow<py::array_t<T>>(array);
   wiw::bindings::expect_shape(typed, shape, expected);

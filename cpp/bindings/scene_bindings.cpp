@@ -53,7 +53,7 @@ py::array_t<float> matrix_to_array(const Eigen::Matrix4f& matrix) {
   return array;
 }
 
-py::dict instance_to_dict(const Scene& scene, const wiw::scene::Instance& instance) {
+py::dict instance_to_dict(const Scene& scene, const wiw::scene::Instance& instance, const Eigen::AlignedBox3f& bounds) {
   std::size_t triangles = 0;
   for (const std::uint32_t mesh : instance.meshes) triangles += scene.meshes[mesh].triangles.size();
   py::dict result;
@@ -62,14 +62,21 @@ py::dict instance_to_dict(const Scene& scene, const wiw::scene::Instance& instan
   result["category"] = instance.category == wiw::scene::kNone ? std::string() : scene.categories[instance.category];
   result["attributes"] = instance.attributes;
   result["T_world_instance"] = matrix_to_array(instance.T_world_instance.matrix());
-  result["bounds"] = box_to_array(wiw::scene::instance_bounds(scene, instance));
+  result["bounds"] = box_to_array(bounds);
   result["triangle_count"] = triangles;
   return result;
 }
 
 py::list instances_to_list(const Scene& scene) {
+  std::vector<Eigen::AlignedBox3f> bounds;
+  {
+    const wiw::bindings::GilRelease release;  // every vertex is looked at
+    for (const wiw::scene::Instance& instance : scene.instances) {
+      bounds.push_back(wiw::scene::instance_bounds(scene, instance));
+    }
+  }
   py::list result;
-  for (const wiw::scene::Instance& instance : scene.instances) result.append(instance_to_dict(scene, instance));
+  for (std::size_t i = 0; i < bounds.size(); ++i) result.append(instance_to_dict(scene, scene.instances[i], bounds[i]));
   return result;
 }
 
@@ -210,7 +217,13 @@ void bind_scene_class(py::module_& module) {
           "What the importer had to leave out, one sentence each.")
       .def_property_readonly("triangle_count", &Scene::triangle_count, "Over all placements.")
       .def_property_readonly(
-          "bounds", [](const Scene& scene) { return box_to_array(scene.bounds()); },
+          "bounds",
+          [](const Scene& scene) {
+            return box_to_array([&] {
+              const wiw::bindings::GilRelease release;
+              return scene.bounds();
+            }());
+          },
           "float32 [2, 3]: least and greatest corner in the world, metres.")
       .def_property_readonly(
           "instances", &instances_to_list,

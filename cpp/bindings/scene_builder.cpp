@@ -10,9 +10,11 @@
 #include <map>
 #include <tuple>
 #include <type_traits>
+#include <utility>
 #include <vector>
 
 #include "arrays.hpp"
+#include "gil.hpp"
 #include "wiw/scene/assemble.hpp"
 #include "wiw/scene/import/category.hpp"
 #include "wiw/scene/relabel.hpp"
@@ -189,6 +191,7 @@ std::shared_ptr<scene::Scene> scene_from_arrays(const py::list& meshes, const st
     add_instances(dict, *scene);
   }
   if (sun) scene->sun = sun_from(*sun);
+  const GilRelease release;
   scene->validate();
   return scene;
 }
@@ -228,7 +231,11 @@ std::shared_ptr<scene::Scene> relabelled_scene(const scene::Scene& scene, const 
                                                const py::object& corners, const py::list& rooms,
                                                const py::kwargs& about) {
   const auto pieces = pieces_from(labels, triangles, corners);
-  auto result = std::const_pointer_cast<scene::Scene>(relabel(scene, pieces, labels_from(instances, rooms)));
+  scene::SceneLabels names = labels_from(instances, rooms);
+  auto result = [&] {
+    const GilRelease release;
+    return std::const_pointer_cast<scene::Scene>(relabel(scene, pieces, std::move(names)));
+  }();
   describe_scene(about, *result);
   return result;
 }
@@ -245,7 +252,11 @@ std::shared_ptr<scene::Scene> assembled_scene(const std::vector<std::shared_ptr<
     placed.push_back({part, instance, Eigen::Affine3f(map.cast<float>())});
   }
   const std::vector<scene::ScenePtr> models(parts.begin(), parts.end());
-  auto result = std::const_pointer_cast<scene::Scene>(assemble(models, placed, labels_from(instances, rooms)));
+  scene::SceneLabels names = labels_from(instances, rooms);
+  auto result = [&] {
+    const GilRelease release;
+    return std::const_pointer_cast<scene::Scene>(assemble(models, placed, std::move(names)));
+  }();
   describe_scene(about, *result);
   return result;
 }

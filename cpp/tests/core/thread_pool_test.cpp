@@ -77,6 +77,18 @@ TEST_CASE("nested calls run inline and errors reach the caller after all work is
   CHECK(done == 100);
 }
 
+TEST_CASE("inline, an error leaves the calls behind it out") {
+  ThreadPool pool(1);
+  int done = 0;
+  CHECK_THROWS_AS(pool.parallel_for(100,
+                                    [&](std::size_t i) {
+                                      ++done;
+                                      if (i == 3) throw std::runtime_error("three");
+                                    }),
+                  std::runtime_error);
+  CHECK(done == 4);
+}
+
 TEST_CASE("callers from several threads take turns") {
   ThreadPool pool(2);
   std::atomic<int> total{0};

@@ -147,6 +147,12 @@ TEST_CASE("starts off the mesh and worlds that lack a part are refused") {
   CHECK_THROWS_AS(env.reset({3, 0, 3}, 0), NavigationError);  // in the block
   CHECK_THROWS_AS(env.reset({50, 0, 50}, 0), NavigationError);
   CHECK_THROWS_AS(env.reset({1, 2, 1}, 0), NavigationError);  // no floor up there
+  const double height = world().navmesh->snap({1, 0, 1})->y();
+  CHECK_NOTHROW(env.reset({1, height + 0.4, 1}, 0));
+  CHECK_THROWS_WITH_AS(env.reset({1, height + 0.6, 1}, 0), doctest::Contains("and 0.5 m above or below"),
+                       NavigationError);
+  CHECK_THROWS_WITH_AS(env.reset({1, height + 0.6, 1}, 0), doctest::Contains("m beside and 0.6 m below"),
+                       NavigationError);
   CHECK_THROWS_AS(env.reset({1, 0, 1}, std::nan("")), ArgumentError);
   CHECK_THROWS_AS(env.reset({1, 0, 1}, 0, std::nan("")), ArgumentError);
   CHECK_THROWS_AS(NavigationEnv({nullptr, world().navmesh, world().ground}, {}), ArgumentError);

@@ -3,6 +3,7 @@
 #include <doctest/doctest.h>
 #include <unistd.h>
 
+#include <cmath>
 #include <cstring>
 #include <filesystem>
 #include <fstream>
@@ -109,6 +110,15 @@ class TileFile {
       for (int k = 0; k < polygon.vertCount; ++k) sides += polygon.neis[k] != 0;
     }
     return sides;
+  }
+
+  [[nodiscard]] dtPoly polygon(int index) const {
+    dtPoly polygon;
+    std::memcpy(&polygon, arrays_[1].data() + static_cast<std::size_t>(index) * sizeof(dtPoly), sizeof polygon);
+    return polygon;
+  }
+  void set_polygon(int index, const dtPoly& polygon) {
+    std::memcpy(arrays_[1].data() + static_cast<std::size_t>(index) * sizeof(dtPoly), &polygon, sizeof polygon);
   }
 
   dtMeshHeader header{};
@@ -218,4 +228,38 @@ TEST_CASE("every field of the settings survives the file") {
   std::filesystem::remove(path);
   CHECK_THROWS_AS(mesh->save("/no/such/folder/x.navmesh"), FileError);
   CHECK_THROWS_AS(mesh->save(path, 3), ArgumentError);
+}
+
+TEST_CASE("a side that only one of its polygons knows of is a wall, and the reason where no way leads around it") {
+  test::Soup soup;  // two rooms and the corridor between them
+  soup.floor(0, 0, 3, 3);
+  soup.floor(3, 1, 6, 2);
+  soup.floor(6, 0, 9, 3);
+  const std::string path = scratch_file("walls.navmesh");
+  NavMesh::from_triangles(soup.vertices, soup.triangles)->save(path, 1);
+  const TileFile good(read_all(path));
+  int disconnected = 0;
+  for (int i = 0; i < good.header.polyCount; ++i) {
+    for (int k = 0; k < good.polygon(i).vertCount; ++k) {
+      dtPoly polygon = good.polygon(i);
+      if (polygon.neis[k] == 0) continue;
+      polygon.neis[k] = 0;
+      TileFile file = good;
+      file.set_polygon(i, polygon);
+      write_all(path, file.bytes());
+      const auto mesh = NavMesh::load(path);
+      const auto points = mesh->sample(12, 1, -1);
+      const DistanceField field(mesh, {points.data(), 1});
+      for (const Vector3f& point : points) {
+        const Path way = mesh->shortest_path(point, points[0]);
+        CHECK(std::isinf(way.length) == (way.reason != NoPathReason::kNone));
+        CHECK(way.points.empty() == std::isinf(way.length));
+        const Distance distance = field.distance(point);
+        CHECK(std::isinf(distance.metres) == (distance.reason != NoPathReason::kNone));
+        disconnected += way.reason == NoPathReason::kDisconnected && distance.reason == NoPathReason::kDisconnected;
+      }
+    }
+  }
+  CHECK(disconnected > 0);
+  std::filesystem::remove(path);
 }

@@ -2,6 +2,7 @@
 #include "wiw/nav/ground.hpp"
 
 #include <doctest/doctest.h>
+#include <sys/resource.h>
 
 #include <cmath>
 #include <limits>
@@ -110,5 +111,27 @@ TEST_CASE("heights on a bumpy sheet are those of every triangle looked at") {
       if (weights.minCoeff() > -1e-7) expected = std::max(expected, corners.row(1).dot(weights));
     }
     CHECK(ground.height(point) == doctest::Approx(expected).epsilon(1e-5));
+  }
+}
+
+TEST_CASE("hundreds of floors above each other take memory by their number, and keep their heights") {
+  scene::TriangleSoup soup;
+  constexpr int kFloors = 600;
+  for (int i = 0; i < kFloors; ++i) {
+    const auto height = static_cast<float>(i);
+    add_quad(soup, {0, height, 0}, {0, height, 500}, {500, height, 500}, {500, height, 0});
+  }
+  const auto peak = [] {
+    rusage use{};
+    getrusage(RUSAGE_SELF, &use);
+    return use.ru_maxrss;  // kilobytes
+  };
+  const auto before = peak();
+  const nav::Ground ground(soup);  // with each triangle in all cells of 0.25 m: 5 GB
+  CHECK(peak() - before < 500'000);
+  std::mt19937 random(7);
+  std::uniform_real_distribution<double> place(0, 500);
+  for (int i = 0; i < kFloors; i += 7) {
+    CHECK(ground.height({place(random), i + 0.2, place(random)}) == doctest::Approx(i));
   }
 }

@@ -2,6 +2,7 @@
 #include <doctest/doctest.h>
 
 #include <cmath>
+#include <limits>
 
 #include "wiw/core/error.hpp"
 #include "wiw/core/rng.hpp"
@@ -226,5 +227,31 @@ TEST_CASE("a world with arms forks and repeats to the bit") {
     }
     REQUIRE(fork->snapshot().numbers == world.snapshot().numbers);
     REQUIRE(fork->attachments().size() == world.attachments().size());
+  }
+}
+
+TEST_CASE("restarts stay within limits that lie beyond half a turn") {
+  constexpr double kInfinity = std::numeric_limits<double>::infinity();
+  struct Case {
+    double lower, upper, start, outside, inside;
+  };
+  for (const Case& each : {Case{3.5, 5, 3.5, 3.3, 4.9}, Case{-5, -3.5, -3.5, -3.3, -4.9},
+                           Case{3.5, kInfinity, 3.5, 3.3, 4.9}, Case{-kInfinity, -3.5, -3.5, -3.3, -4.9}}) {
+    const auto number = [](double value) { return VectorXd::Constant(1, value); };
+    std::vector<Link> links{{.name = "base"}, {.name = "tip"}};
+    std::vector<Joint> joints{
+        {.name = "j", .type = JointType::kRevolute, .axis = Eigen::Vector3d::UnitZ(), .index = 0}};
+    const auto robot =
+        std::make_shared<Articulation>("turned", std::move(links), std::move(joints),
+                                       JointLimits{number(each.lower), number(each.upper), number(1), number(1)});
+    const InverseKinematics ik(robot, 1);
+    const auto turned = [](double angle) { return Pose(Eigen::AngleAxisd(angle, Vector3d::UnitZ())); };
+    const IkResult none = ik.solve(turned(each.outside), number(each.start), {.rotation_tolerance = 0.15});
+    CHECK(none.reached() == (each.upper - each.lower == kInfinity));  // a turn further on
+    CHECK(none.joints[0] >= each.lower);
+    CHECK(none.joints[0] <= each.upper);
+    const IkResult found = ik.solve(turned(each.inside), number(each.start));
+    CHECK(found.reached());
+    CHECK(found.joints[0] == doctest::Approx(each.inside).epsilon(1e-3));
   }
 }

@@ -96,8 +96,31 @@ TEST_CASE("impossible shapes are refused") {
   CHECK_THROWS_AS(check_part({Box{{0.1, 0, 0.1}}}, "x"), ArgumentError);
   CHECK_THROWS_AS(check_part({Sphere{-1}}, "x"), ArgumentError);
   CHECK_THROWS_AS(check_part({Cylinder{nan, 1}}, "x"), ArgumentError);
+  CHECK_THROWS_WITH_AS(check_part({Cylinder{1e-200, 1}}, "x"),
+                       "x: expected a radius of 1e-09 metres or more, got 1e-200", ArgumentError);
   CHECK_THROWS_AS(check_part({ConvexHull{{{0, 0, 0}, {1, 0, 0}, {0, 1, 0}, {1, 1, 0}}}}, "x"), ArgumentError);
   Part skewed{Sphere{1}};
   skewed.pose.matrix()(0, 1) = 1;
   CHECK_THROWS_AS(check_part(skewed, "x"), ArgumentError);
+}
+
+TEST_CASE("a rod is as solid as a plate; what only rounding makes thick is flat") {
+  const Vector3d away(0.3, 0.2, -0.1);
+  for (const Vector3d& size : {Vector3d(1e-3, 1e-3, 1), Vector3d(1e-5, 2e-5, 1), Vector3d(1e-5, 1, 1)}) {
+    const ConvexHull hull = corners(size, away);
+    CHECK(hull_mesh(hull.points).vertices.size() == 8);
+    CHECK_NOTHROW(check_part({hull}, "x"));
+    const MassProperties solid = mass_properties(std::vector<Part>{{hull}}, 1);
+    CHECK((solid.center - away).norm() < 1e-4);
+    CHECK(solid.inertia(0, 0) == doctest::Approx((size.y() * size.y() + size.z() * size.z()) / 12).epsilon(1e-3));
+  }
+  Rng random(5);
+  for (const Vector3d& size : {Vector3d(0, 0, 1), Vector3d(0, 1, 1), Vector3d(0, 0.1, 1)}) {
+    ConvexHull hull = corners(size, away);
+    for (Vector3d& point : hull.points) {
+      point += 1e-7 * Vector3d(random.uniform(-1, 1), random.uniform(-1, 1), random.uniform(-1, 1));
+    }
+    CHECK(hull_mesh(hull.points).vertices.empty());
+    CHECK_THROWS_AS(check_part({hull}, "x"), ArgumentError);
+  }
 }

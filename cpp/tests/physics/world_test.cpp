@@ -7,6 +7,7 @@
 #include <thread>
 
 #include "wiw/core/error.hpp"
+#include "wiw/core/intrinsics.hpp"
 #include "wiw/core/rng.hpp"
 
 using namespace wiw;
@@ -208,4 +209,31 @@ TEST_CASE("bad numbers are refused and leave the world as it was") {
   CHECK_THROWS_AS(heap(1)->restore(before), ArgumentError);
   CHECK(world.snapshot().numbers == before.numbers);
   CHECK(world.body_count() == 2);
+}
+
+TEST_CASE("rods and discs as thin as one likes come to lie on the floor") {
+  const Pose lying(Eigen::AngleAxisd(kPi / 2, Eigen::Vector3d::UnitX()));
+  const Pose level = Pose::Identity();
+  const auto rod = [](double width) {
+    ConvexHull hull;
+    for (int i = 0; i < 8; ++i) {
+      hull.points.emplace_back(i & 1 ? width : -width, i & 2 ? width : -width, i & 4 ? 0.5 : -0.5);
+    }
+    return hull;
+  };
+  const auto end_of = [](const Part& thing) {
+    World world;
+    add(world, Box{{10, 10, 1}}, 0, at(0, 0, -0.5));
+    world.add_body({.parts = {thing}, .mass = 0.1, .T_world_body = at(0, 0, 0.01)});
+    world.step(240);
+    return Vector3d(world.body_poses()[1].translation());
+  };
+  for (const Part& thing :
+       {Part{Cylinder{0.0005, 1}, lying}, Part{Cylinder{1e-5, 1}, lying}, Part{Cylinder{0.5, 0.0005}, level},
+        Part{Cylinder{0.5, 1e-9}, level}, Part{rod(0.0005), lying}, Part{rod(1e-5), lying}}) {
+    const Vector3d end = end_of(thing);
+    CHECK(std::abs(end.z()) < 0.005);
+    CHECK(end.head<2>().norm() < 1);
+  }
+  CHECK(end_of({Cylinder{1e-9, 1}, lying}).allFinite());  // too thin to be kept out of the floor
 }

@@ -7,6 +7,7 @@
 
 #include <algorithm>
 #include <filesystem>
+#include <regex>
 #include <set>
 #include <span>
 
@@ -233,4 +234,20 @@ TEST_CASE("a cache is on the disk before it has its name, and its name after") {
 
 TEST_CASE("a cache that cannot be written says so") {
   CHECK_THROWS_AS(wiw::scene::write_scene_cache(full_scene(), "/nonexistent/folder/scene.wiwscene"), wiw::FileError);
+}
+
+TEST_CASE("drafts have random bits in their names, for writers on machines that share the folder") {
+  const Folder folder;
+  const auto file = folder.path() / "scene.wiwscene";
+  std::set<std::string> seen;
+  for (int i = 0; i < 2; ++i) {
+    syncs.clear();
+    wiw::scene::write_scene_cache(full_scene(), file);
+    REQUIRE_FALSE(syncs.empty());
+    const std::string name = syncs[0].path.substr(file.string().size());
+    std::smatch parts;
+    REQUIRE(std::regex_match(name, parts, std::regex(R"(\.\d+-\d+-(\d+)\.tmp)")));
+    seen.insert(parts[1].str());
+  }
+  CHECK(seen.size() == 2);
 }

@@ -253,6 +253,30 @@ TEST_CASE("PLY elements come once, vertices first, with properties") {
   CHECK_THROWS_WITH_AS(load_mesh(ply("element vertex 3\n" + faces)), doctest::Contains("no property"), FileError);
 }
 
+TEST_CASE("rows and counts of a PLY file of text are checked before it is read") {
+  const Folder folder;
+  const auto ply = [&](const std::string& vertices, const std::string& faces, const std::string& rows,
+                       const std::string& format = "ascii") {
+    return folder.write("a.ply", "ply\nformat " + format + " 1.0\nelement vertex " + vertices +
+                                     "\nproperty float x\nproperty float y\nproperty float z\nelement face " + faces +
+                                     "\nproperty list uchar int vertex_indices\nend_header\n" + rows);
+  };
+  const std::string rows = "0 0 7\n1 0 7\n0 1 7\n3 0 1 2\n";
+  CHECK(load_mesh(ply("3", "1", rows))->triangle_count() == 1);
+  CHECK_THROWS_WITH_AS(load_mesh(ply("3", "1", "0 0 7\n1 0\n0 1 7\n3 0 1 2\n")),
+                       doctest::Contains("vertex 1 has fewer entries than it says"), FileError);
+  CHECK_THROWS_WITH_AS(load_mesh(ply("3", "2", rows)),
+                       doctest::Contains("should have 2 rows of the element 'face' but has 1 left"), FileError);
+  CHECK_THROWS_WITH_AS(load_mesh(ply("18446744073709551615", "2", rows)),
+                       doctest::Contains("should have 18446744073709551615 rows of the element 'vertex'"), FileError);
+  for (const char* format : {"ascii", "binary_little_endian"}) {
+    for (const char* count : {"-1", "3x", "18446744073709551616", ""}) {
+      CHECK_THROWS_WITH_AS(load_mesh(ply(count, "1", rows, format)),
+                           doctest::Contains("an <element> line without name and count"), FileError);
+    }
+  }
+}
+
 TEST_CASE("transforms that overflow are the file's error") {
   const Folder folder;
   GlbParts parts;

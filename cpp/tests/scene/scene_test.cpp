@@ -55,3 +55,19 @@ TEST_CASE("a sun has a direction of length 1, and strengths in [0, 1]") {
     CHECK_THROWS_WITH_AS(scene.validate(), doctest::Contains("ambient must be in [0, 1]"), wiw::ArgumentError);
   }
 }
+
+TEST_CASE("placements of a mesh sum to what 32 bits can number") {
+  wiw::scene::Scene scene = one_triangle();
+  auto& mesh = scene.meshes[0];
+  mesh.positions = std::vector<Eigen::Vector3f>(1'000'000, Eigen::Vector3f::Zero());
+  scene.instances[0].meshes.assign(1500, 0);
+  CHECK_NOTHROW(scene.validate());
+  scene.instances[0].meshes.assign(1501, 0);
+  CHECK_THROWS_WITH_AS(scene.validate(), doctest::Contains("more than 1500000000 vertices"), wiw::ArgumentError);
+  mesh.positions = std::vector<Eigen::Vector3f>(3, Eigen::Vector3f::Zero());
+  mesh.triangles = std::vector<Eigen::Matrix<std::uint32_t, 3, 1>>(1'000'000, {0, 1, 2});
+  scene.instances[0].meshes.assign(500, 0);
+  CHECK_NOTHROW(scene.validate());
+  scene.instances.push_back({2, "more", wiw::scene::kNone, {0}});
+  CHECK_THROWS_WITH_AS(scene.validate(), doctest::Contains("more than 500000000 triangles"), wiw::ArgumentError);
+}

@@ -25,8 +25,9 @@ class ThreadPool {
   [[nodiscard]] int size() const { return static_cast<int>(workers_.size()) + 1; }
 
   /// Calls body(i) for every i in [0, count), in any order, and returns when all are done. The first exception is
-  /// rethrown here after the others have finished. A call from inside a body runs inline, and so does one in a forked
-  /// child, where only the thread that forked exists.
+  /// rethrown here: after all other calls where threads share the work, at once where it runs inline, which leaves the
+  /// calls behind it out. A call from inside a body runs inline, and so does one in a forked child, where only the
+  /// thread that forked exists.
   void parallel_for(std::size_t count, const std::function<void(std::size_t)>& body);
 
   /// The pool all rooms share; its size is the machine's cores, or WIW_NUM_THREADS.

@@ -36,10 +36,18 @@ void NavigationEnv::reset(const Eigen::Vector3d& position, double yaw, double to
   }
   const auto snapped = world_.navmesh->snap(position.cast<float>());
   const Eigen::Vector3d away = snapped ? Eigen::Vector3d(snapped->cast<double>() - position) : Eigen::Vector3d::Zero();
-  if (!snapped || std::hypot(away.x(), away.z()) > tolerance || std::abs(away.y()) > kMaxLift) {
-    throw NavigationError(
-        "NavigationEnv.reset: " + text_of(position) + " is not on the navigation mesh (nearest point " +
-        (snapped ? text_of(snapped->cast<double>()) : "none") + ", tolerance " + std::to_string(tolerance) + " m)");
+  const double beside = std::hypot(away.x(), away.z());
+  if (!snapped || beside > tolerance || std::abs(away.y()) > kMaxLift) {
+    std::ostringstream text;
+    text << "NavigationEnv.reset: " << text_of(position) << " is not on the navigation mesh: expected a point of it at "
+         << "most " << tolerance << " m beside and " << kMaxLift << " m above or below; ";
+    if (snapped) {
+      text << "the nearest, " << text_of(snapped->cast<double>()) << ", is " << beside << " m beside and "
+           << std::abs(away.y()) << " m " << (away.y() > 0 ? "above" : "below");
+    } else {
+      text << "there is none near it";
+    }
+    throw NavigationError(text.str());
   }
   stand_at(*snapped);
   start_position_ = position_;

@@ -2,6 +2,7 @@
 #include "wiw/nav/distance_field.hpp"
 
 #include <algorithm>
+#include <cmath>
 #include <limits>
 #include <string>
 
@@ -32,7 +33,8 @@ Distance DistanceField::distance(const Eigen::Vector3f& point) const {
   const int island = mesh_->surface().polygon_island[projection->polygon];
   if (std::find(islands_.begin(), islands_.end(), island) == islands_.end())
     return {kInfinity, NoPathReason::kOtherIsland};
-  return {search_->metres(mesh_->geodesics().site(*projection)), NoPathReason::kNone};
+  const double metres = search_->metres(mesh_->geodesics().site(*projection));
+  return {metres, std::isfinite(metres) ? NoPathReason::kNone : NoPathReason::kDisconnected};
 }
 
 }  // namespace wiw::nav

@@ -14,6 +14,8 @@ namespace {
 constexpr double kBelow = 0.45, kAbove = 0.1;  // metres
 constexpr float kLeastUpright = 0.3f;          // |y| of a unit normal: slopes of up to 72 degrees
 constexpr double kMostCells = 4e6;
+// Of triangles in cells: 100 MB, and what a fine mesh needs whose triangles touch a few cells each.
+constexpr std::size_t kMostEntries = 25'000'000, kMostEntriesEach = 8;
 
 /// Height of the triangle's plane at (x, z) where that lies in the triangle, edges included.
 std::optional<double> height_at(const Eigen::Matrix3f& corners, double x, double z) {
@@ -71,10 +73,6 @@ Ground::Ground(const scene::TriangleSoup& soup) {
   const Eigen::Vector2d size = box.max().cast<double>() - box.min().cast<double>();
   // The last bound is for a strip narrower than a cell: its area does not tell how many cells it needs.
   cell_ = std::max({cell_, std::sqrt(size.x() * size.y() / kMostCells), size.maxCoeff() / kMostCells});
-  cells_ = (size / cell_).array().floor().cast<int>() + 1;
-
-  // Counting sort: first how many triangles touch each cell, then where they go.
-  first_.assign(static_cast<std::size_t>(cells_.prod()) + 1, 0);
   const auto for_cells = [this](const TriangleCorners& corners, auto&& visit) {
     const Eigen::Vector3f low = corners.rowwise().minCoeff(), high = corners.rowwise().maxCoeff();
     // Wider than by what `height_at` allows beyond the edges, and by rounding.
@@ -87,8 +85,20 @@ Ground::Ground(const scene::TriangleSoup& soup) {
       for (int column = cell_of(range.low - margin, 0).x(); column <= to; ++column) visit(slot(column, row));
     }
   };
-  for (const TriangleCorners& corners : triangles_)
-    for_cells(corners, [this](std::size_t cell) { ++first_[cell + 1]; });
+  // Counting sort: first how many triangles touch each cell, then where they go. Where large triangles lie above each
+  // other, each is in all of these cells; larger ones take less memory and more time, and change no height.
+  const std::size_t most = kMostEntries + kMostEntriesEach * triangles_.size();
+  const auto count_entries = [&] {
+    cells_ = (size / cell_).array().floor().cast<int>() + 1;
+    first_.assign(static_cast<std::size_t>(cells_.prod()) + 1, 0);
+    std::size_t entries = 0;
+    for (const TriangleCorners& corners : triangles_) {
+      for_cells(corners, [&](std::size_t cell) { ++first_[cell + 1], ++entries; });
+      if (entries > most) return false;
+    }
+    return true;
+  };
+  while (!count_entries()) cell_ *= 2;
   std::partial_sum(first_.begin(), first_.end(), first_.begin());
   entries_.resize(first_.back());
   std::vector<std::size_t> next(first_.begin(), first_.end() - 1);

@@ -15,7 +15,8 @@ namespace wiw::nav {
 /// camera put above the navigation mesh would hang higher than it should, by another amount in every scene.
 class Ground {
  public:
-  /// Level enough triangles of the scene, sorted into columns of 0.25 m; a scene without any has no ground anywhere.
+  /// Level enough triangles of the scene, sorted into columns of 0.25 m, or wider ones where these would take too much
+  /// memory; a scene without any has no ground anywhere.
   explicit Ground(const scene::Scene& scene) : Ground(scene::world_triangles(scene)) {}
   explicit Ground(const scene::TriangleSoup& soup);
 
@@ -32,7 +33,7 @@ class Ground {
 
   std::vector<TriangleCorners> triangles_;
   Eigen::Vector2f origin_ = Eigen::Vector2f::Zero();  // least x and z
-  double cell_ = 0.25;                                // metres
+  double cell_ = 0.25;                                // metres, at least
   Eigen::Vector2i cells_ = Eigen::Vector2i::Zero();
   std::vector<std::size_t> first_;      // per cell, and one more: where its entries begin
   std::vector<std::uint32_t> entries_;  // indices of triangles

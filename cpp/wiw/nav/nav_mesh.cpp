@@ -22,6 +22,7 @@ const char* reason_text(NoPathReason reason) {
     case NoPathReason::kEndOffMesh: return "end off mesh";
     case NoPathReason::kOtherIsland: return "other island";
     case NoPathReason::kSearchLimit: return "search limit of 256 polygons or 2048 nodes";
+    case NoPathReason::kDisconnected: return "disconnected mesh";
   }
   return "";
 }
@@ -138,6 +139,8 @@ Distance NavMesh::geodesic_distance(const Eigen::Vector3f& start, const Eigen::V
 Path NavMesh::exact_path(const MeshPoint& start, const MeshPoint& end) const {
   const Geodesics& exact = geodesics();
   const Geodesics::Way way = exact.way(exact.site(start), exact.site(end));
+  // Islands go by the links of the file, where a side may lead one way only; such a side is a wall to exact paths.
+  if (!std::isfinite(way.metres)) return {.length = way.metres, .reason = NoPathReason::kDisconnected};
   Path path{.points = {start.point}, .length = way.metres};
   for (const int corner : way.corners) {
     path.points.emplace_back(mesh_.tile().verts + 3 * exact.corners().list[corner].vertex);

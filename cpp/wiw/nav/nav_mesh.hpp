@@ -25,7 +25,7 @@ enum class Metric {
 };
 
 /// Why there is no path.
-enum class NoPathReason { kNone, kStartOffMesh, kEndOffMesh, kOtherIsland, kSearchLimit };
+enum class NoPathReason { kNone, kStartOffMesh, kEndOffMesh, kOtherIsland, kSearchLimit, kDisconnected };
 const char* reason_text(NoPathReason reason);
 
 struct Distance {

@@ -67,7 +67,7 @@ class Articulation {
   /// `folder` is where relative mesh files are looked for.
   static std::shared_ptr<const Articulation> parse(const std::string& urdf, const std::filesystem::path& folder = {});
 
-  /// Expects consistent parts; the URDF readers check them.
+  /// Expects consistent parts; those who read a URDF file or parts check them.
   Articulation(std::string name, std::vector<Link> links, std::vector<Joint> joints, JointLimits limits);
 
   [[nodiscard]] const std::string& name() const { return name_; }

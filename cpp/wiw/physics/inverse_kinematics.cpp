@@ -2,10 +2,13 @@
 #include "wiw/physics/inverse_kinematics.hpp"
 
 #include <Eigen/Cholesky>
+#include <algorithm>
 #include <cmath>
 #include <limits>
+#include <utility>
 
 #include "wiw/core/error.hpp"
+#include "wiw/core/intrinsics.hpp"
 #include "wiw/core/rng.hpp"
 
 namespace wiw::physics {
@@ -18,7 +21,6 @@ using Jacobian = Eigen::Matrix<double, 6, Eigen::Dynamic, 0, 6, kMax>;
 using Vector6 = Eigen::Matrix<double, 6, 1>;
 using Matrix6 = Eigen::Matrix<double, 6, 6>;
 
-constexpr double kPi = 3.14159265358979323846;
 constexpr double kDampingGain = 0.03;  // by squared error; found best of 0.003 to 0.5 on random Panda poses
 constexpr double kDamping = 1e-4;      // what is left of the damping at the target
 constexpr double kPositionWeight = 3;  // radians a metre: 33 cm of error count as much as one radian
@@ -35,6 +37,14 @@ Eigen::Vector3d log_of(const Eigen::Matrix3d& r) {
     return turn.angle() * turn.axis();
   }
   return v * (std::atan2(sine, cosine) / (2 * sine));
+}
+
+/// Where restarts put a joint: within its limits, which may be infinite, and as near to zero as these let it be.
+std::pair<double, double> range_of_restarts(double lower, double upper) {
+  const double low = std::max(lower, -kPi), high = std::min(upper, kPi);
+  if (low <= high) return {low, high};
+  // The limits lie beyond half a turn, on one side of it.
+  return {std::isfinite(lower) ? lower : upper - 2 * kPi, std::isfinite(upper) ? upper : lower + 2 * kPi};
 }
 
 }  // namespace
@@ -185,7 +195,8 @@ struct InverseKinematics::Search {
   void randomise(Rng& rng) {
     for (Eigen::Index i = 0; i < n; ++i) {
       const Step& step = chain[static_cast<std::size_t>(i)];
-      q[i] = rng.uniform(std::max(step.lower, -kPi), std::min(step.upper, kPi));
+      const auto [low, high] = range_of_restarts(step.lower, step.upper);
+      q[i] = rng.uniform(low, high);
     }
   }
 

@@ -5,19 +5,23 @@
 
 #include <Eigen/Eigenvalues>
 #include <cmath>
+#include <sstream>
 
 #include "wiw/core/error.hpp"
+#include "wiw/core/intrinsics.hpp"
 #include "wiw/physics/bullet/convert.hpp"
 
 namespace wiw::physics {
 
 namespace {
 
-constexpr double kPi = 3.14159265358979323846;
+constexpr double kLeastLength = 1e-9;  // metres; products of much smaller ones are zero, and so would be the mass
 
 void check_length(double value, const char* what, const std::string& owner) {
-  if (std::isfinite(value) && value > 0) return;
-  throw ArgumentError(owner + ": expected a positive " + what + " in metres, got " + std::to_string(value));
+  if (std::isfinite(value) && value >= kLeastLength) return;
+  std::ostringstream text;
+  text << owner << ": expected a " << what << " of " << kLeastLength << " metres or more, got " << value;
+  throw ArgumentError(text.str());
 }
 
 struct Check {
@@ -98,17 +102,22 @@ struct UnitDensity {
   }
 };
 
-/// Thinner than a thousandth of a thousandth of its extent cubed.
+/// Thinner than a few millionths of its extent, so that rounding may have made what thickness there is. The volume of a
+/// convex body is its surface times a sixth to a half of its thickness, for slabs and for rods; of its extent cubed, a
+/// rod has next to nothing however stout it is.
 bool is_flat(const HullMesh& mesh) {
+  if (mesh.vertices.empty()) return true;
   Eigen::AlignedBox3d bounds;
-  double volume = 0;
+  double volume = 0, surface = 0;
   for (const Eigen::Vector3d& vertex : mesh.vertices) bounds.extend(vertex);
+  const Eigen::Vector3d origin = mesh.vertices[0];
   for (const Eigen::Vector3i& t : mesh.triangles) {
-    const Eigen::Vector3d origin = mesh.vertices[0];
-    volume +=
-        (mesh.vertices[t.x()] - origin).dot((mesh.vertices[t.y()] - origin).cross(mesh.vertices[t.z()] - origin)) / 6;
+    const Eigen::Vector3d a = mesh.vertices[t.x()] - origin, b = mesh.vertices[t.y()] - origin,
+                          c = mesh.vertices[t.z()] - origin;
+    volume += a.dot(b.cross(c)) / 6;
+    surface += (b - a).cross(c - a).norm() / 2;
   }
-  return mesh.vertices.empty() || std::abs(volume) <= 1e-6 * std::pow(bounds.diagonal().norm(), 3);
+  return std::abs(volume) <= 1e-6 * bounds.diagonal().norm() * surface;
 }
 
 }  // namespace
@@ -126,9 +135,8 @@ void check_part(const Part& part, const std::string& owner) {
   std::visit(Check{owner}, part.shape);
 }
 
-HullMesh hull_mesh(std::span<const Eigen::Vector3d> points) {
+HullMesh thin_hull_mesh(std::span<const Eigen::Vector3d> points) {
   HullMesh mesh;
-  if (points.size() < 4) return mesh;
   btConvexHullComputer computer;
   computer.compute(points[0].data(), sizeof(Eigen::Vector3d), static_cast<int>(points.size()), 0, 0);
   // Bullet computes on a grid; the vertices themselves are taken from the input.
@@ -143,6 +151,12 @@ HullMesh hull_mesh(std::span<const Eigen::Vector3d> points) {
       mesh.triangles.emplace_back(apex, edge->getSourceVertex(), edge->getTargetVertex());
     }
   }
+  return mesh;
+}
+
+HullMesh hull_mesh(std::span<const Eigen::Vector3d> points) {
+  if (points.size() < 4) return {};
+  HullMesh mesh = thin_hull_mesh(points);
   return is_flat(mesh) ? HullMesh{} : mesh;
 }
 

@@ -35,7 +35,8 @@ struct Part {
   Pose pose = Pose::Identity();
 };
 
-/// Throws ArgumentError, naming `owner`, unless lengths are positive, poses rigid and hulls have a volume.
+/// Throws ArgumentError, naming `owner`, unless lengths are a nanometre or more, poses rigid and hulls
+/// have a volume.
 void check_part(const Part& part, const std::string& owner);
 
 /// Throws ArgumentError, naming `what`, unless the pose is finite and its rotation orthonormal.
@@ -48,6 +49,9 @@ struct HullMesh {
   std::vector<Eigen::Vector3i> triangles;
 };
 HullMesh hull_mesh(std::span<const Eigen::Vector3d> points);
+
+/// The same for points that are known to span a volume, however little: a cylinder may be as thin as one likes.
+HullMesh thin_hull_mesh(std::span<const Eigen::Vector3d> points);
 
 struct MassProperties {
   double mass = 0;

@@ -10,6 +10,7 @@
 
 #include "wiw/core/error.hpp"
 #include "wiw/physics/articulation.hpp"
+#include "wiw/physics/articulation_check.hpp"
 #include "wiw/physics/mesh_file.hpp"
 #include "wiw/physics/urdf_text.hpp"
 #include "wiw/scene/import/file.hpp"
@@ -79,12 +80,13 @@ class UrdfReader {
     add(*model_.getRoot());
     for (Joint& joint : joints_) couple(joint);
     JointLimits limits;
-    const auto vector = [&](double Range::* field) {
+    const auto vector = [&](double JointRange::* field) {
       Eigen::VectorXd values(static_cast<Eigen::Index>(ranges_.size()));
       for (std::size_t i = 0; i < ranges_.size(); ++i) values[static_cast<Eigen::Index>(i)] = ranges_[i].*field;
       return values;
     };
-    limits = {vector(&Range::lower), vector(&Range::upper), vector(&Range::velocity), vector(&Range::effort)};
+    limits = {vector(&JointRange::lower), vector(&JointRange::upper), vector(&JointRange::velocity),
+              vector(&JointRange::effort)};
     for (Link& link : links_) link.name = restore_percent_signs(link.name);
     for (Joint& joint : joints_) joint.name = restore_percent_signs(joint.name);
     return std::make_shared<Articulation>(restore_percent_signs(model_.getName()), std::move(links_),
@@ -92,10 +94,6 @@ class UrdfReader {
   }
 
  private:
-  struct Range {
-    double lower, upper, velocity, effort;
-  };
-
   /// A link and all below it. urdfdom lets a link have two parents, and be above itself.
   void add(const urdf::Link& from, int depth = 0) {
     if (!met_.insert(from.name).second) {
@@ -148,18 +146,15 @@ class UrdfReader {
                         "' is of a type that is not supported; expected fixed, revolute, continuous or prismatic");
   }
 
-  [[nodiscard]] Range range_of(const urdf::Joint& joint) const {
+  [[nodiscard]] JointRange range_of(const urdf::Joint& joint) const {
     const double inf = std::numeric_limits<double>::infinity();
-    Range range{-inf, inf, inf, inf};
+    JointRange range{-inf, inf, inf, inf};
     if (joint.limits) {
       if (joint.type != urdf::Joint::CONTINUOUS) range.lower = joint.limits->lower, range.upper = joint.limits->upper;
       range.velocity = joint.limits->velocity;
       range.effort = joint.limits->effort;
     }
-    if (!(range.lower <= range.upper) || !(range.velocity > 0) || !(range.effort > 0)) {
-      throw ArgumentError(source_ + ": the limits of joint '" + joint.name +
-                          "' are impossible; expected lower <= upper, positive velocity and effort");
-    }
+    check_range(range, source_ + ": the limits of joint '" + joint.name + "'");
     return range;
   }
 
@@ -193,16 +188,10 @@ class UrdfReader {
   [[nodiscard]] MassProperties to_inertial(const urdf::Inertial& from, const std::string& name) const {
     Eigen::Matrix3d inertia;
     inertia << from.ixx, from.ixy, from.ixz, from.ixy, from.iyy, from.iyz, from.ixz, from.iyz, from.izz;
-    if (!(from.mass >= 0) || !std::isfinite(from.mass) || !inertia.allFinite()) {
-      throw ArgumentError(source_ + ": link '" + name +
-                          "': expected a mass of zero or more, and finite inertia, got mass " +
-                          std::to_string(from.mass));
-    }
-    const MassProperties properties{.mass = from.mass, .inertia = inertia};
-    if (principal_frame(properties).moments.minCoeff() < -1e-9) {
-      throw ArgumentError(source_ + ": link '" + name + "': the inertia has a negative principal moment");
-    }
-    return moved(properties, to_pose(from.origin, "inertial of link '" + name + "'"));
+    const MassProperties properties =
+        moved({.mass = from.mass, .inertia = inertia}, to_pose(from.origin, "inertial of link '" + name + "'"));
+    check_inertial(properties, source_ + ": link '" + name + "'");
+    return properties;
   }
 
   [[nodiscard]] Shape to_shape(const urdf::Geometry& from, const std::string& link) const {
@@ -240,7 +229,7 @@ class UrdfReader {
   std::unordered_set<std::string> met_;  // links by name
   std::vector<Link> links_;
   std::vector<Joint> joints_;
-  std::vector<Range> ranges_;
+  std::vector<JointRange> ranges_;
 };
 
 ArticulationPtr read_model(const std::string& text, const std::string& source, const fs::path& folder) {

@@ -122,7 +122,8 @@ class World {
   [[nodiscard]] std::vector<Pose> link_poses(int articulation) const;
   /// T_world_link of every link as Bullet holds them, for comparison.
   [[nodiscard]] std::vector<Pose> simulated_link_poses(int articulation) const;
-  /// Puts the joints somewhere, at rest, and targets there.
+  /// Puts the joints somewhere, at rest, and targets there. Held bodies stay where they are, and the next steps would
+  /// pull them to the link: let go of them before, or put them where they belong after.
   void set_joint_positions(int articulation, const Eigen::VectorXd& positions);
   void set_joint_velocities(int articulation, const Eigen::VectorXd& velocities);
   /// Where the motors go from the next step on. ArgumentError for NaN and for targets outside the limits.

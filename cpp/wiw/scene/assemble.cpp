@@ -9,9 +9,7 @@
 #include "wiw/scene/import/mesh_baker.hpp"
 
 namespace wiw::scene {
-namespace {
 
-/// Adds a part's textures, materials and warnings; returns the index of its first material.
 std::int32_t add_appearance(const Scene& part, Scene& scene) {
   const auto first_texture = static_cast<std::int32_t>(scene.textures.size());
   const auto first_material = static_cast<std::int32_t>(scene.materials.size());
@@ -23,6 +21,8 @@ std::int32_t add_appearance(const Scene& part, Scene& scene) {
   scene.warnings.insert(scene.warnings.end(), part.warnings.begin(), part.warnings.end());
   return first_material;
 }
+
+namespace {
 
 /// A placement as a rigid pose, then what is baked into the vertices.
 struct SplitPose {

@@ -10,6 +10,9 @@
 
 namespace wiw::scene {
 
+/// Adds a part's textures, materials and warnings to a scene; returns the index of the part's first material there.
+std::int32_t add_appearance(const Scene& part, Scene& scene);
+
 /// A model's place in a scene; an instance may have several.
 struct Placement {
   std::uint32_t part = 0;

@@ -72,6 +72,12 @@ void check_sun(const Sun& sun) {
   }
 }
 
+void check_placed(const char* what, std::size_t count, std::size_t most) {
+  if (count <= most) return;
+  throw ArgumentError("Scene: the placements of its meshes sum to more than " + std::to_string(most) + " " + what +
+                      "; place fewer meshes, or meshes of fewer " + what);
+}
+
 }  // namespace
 
 void Scene::validate() const {
@@ -84,15 +90,21 @@ void Scene::validate() const {
   for (const Material& material : materials)
     check_index(material.texture, textures.size(), "texture of '" + material.name + "'");
   for (std::size_t i = 0; i < meshes.size(); ++i) check_mesh(*this, meshes[i], "mesh " + std::to_string(i));
+  std::size_t vertices = 0, triangles = 0;
   for (std::size_t i = 0; i < instances.size(); ++i) {
     const Instance& instance = instances[i];
     if (instance.id != i + 1)
       throw ArgumentError("Scene: instance '" + instance.name + "' must have id " + std::to_string(i + 1));
     check_index(instance.category, categories.size(), "category of '" + instance.name + "'");
     for (const std::uint32_t mesh : instance.meshes) {
-      if (mesh < meshes.size()) continue;
-      throw ArgumentError("Scene: mesh of '" + instance.name + "' is " + std::to_string(mesh) +
-                          ", but there are only " + std::to_string(meshes.size()));
+      if (mesh >= meshes.size()) {
+        throw ArgumentError("Scene: mesh of '" + instance.name + "' is " + std::to_string(mesh) +
+                            ", but there are only " + std::to_string(meshes.size()));
+      }
+      vertices += meshes[mesh].positions.size();
+      triangles += meshes[mesh].triangles.size();
+      check_placed("vertices", vertices, kMostPlacedVertices);
+      check_placed("triangles", triangles, kMostPlacedTriangles);
     }
     if (!instance.T_world_instance.matrix().allFinite()) {
       throw ArgumentError("Scene: the pose of '" + instance.name + "' is not finite");

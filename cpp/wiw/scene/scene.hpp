@@ -98,6 +98,11 @@ struct Sun {
   float ambient = 0.55f;                           // share of the ambient light that is left, in [0, 1]
 };
 
+/// What the placements of a scene may sum to: ten times what importers allow by default, and few enough to be numbered
+/// in 32 bits. A placement costs a few bytes where the whole scene is read, and its mesh where a soup is made of it.
+constexpr std::size_t kMostPlacedTriangles = 500'000'000;
+constexpr std::size_t kMostPlacedVertices = 3 * kMostPlacedTriangles;
+
 /// A whole scene in memory: plain data, immutable once built, shared by renderers, navigation meshes and environments.
 /// World frame: metres, Y up, right-handed.
 struct Scene {
@@ -116,7 +121,7 @@ struct Scene {
   [[nodiscard]] std::size_t triangle_count() const;  // over placements
   [[nodiscard]] Eigen::AlignedBox3f bounds() const;  // world
   /// Throws ArgumentError naming the first broken invariant (index out of range, array length, a position or pose that
-  /// is not finite, a sun out of its ranges).
+  /// is not finite, a sun out of its ranges, placements beyond kMostPlacedTriangles or kMostPlacedVertices).
   void validate() const;
 };
 

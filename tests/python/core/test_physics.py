@@ -3,6 +3,8 @@
 
 from __future__ import annotations
 
+import subprocess
+import sys
 import xml.etree.ElementTree as ET
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
@@ -475,3 +477,66 @@ def test_a_snapshot_of_another_world_is_refused_and_changes_nothing() -> None:
     arm.add_articulation(Articulation.from_text(tree(*[(f"l{i}", f"l{i + 1}", "revolute") for i in range(11)])))
     with pytest.raises(ArgumentError, match="of another world"):
         arm.restore(boxes.snapshot())
+
+
+INDICES = [joint["index"] for joint in panda().to_parts()["joints"]]
+FIRST, FIXED = INDICES.index(0), INDICES.index(-1)
+
+
+@pytest.mark.parametrize(
+    ("place_of_value", "value", "words"),
+    [
+        (("joints", FIXED, "mimic"), [0, 1, 0], "mimics joint 0 of 9; expected two movable joints"),
+        (("joints", FIRST, "mimic"), [0, 1, 0], "mimics joint 0 of 9; expected two movable joints"),
+        (("joints", FIRST, "mimic"), [9, 1, 0], "mimics joint 9 of 9"),
+        (("joints", FIRST, "mimic"), [-1, 1, 0], "mimics joint -1 of 9"),
+        (("joints", FIRST, "mimic"), [1, np.nan, 0], "a finite multiplier and offset"),
+        (("joints", FIRST, "axis"), [0, 0, 0], "to have length 1, got 0"),
+        (("joints", FIRST, "axis"), [np.nan, 0, 1], "to have length 1, got nan"),
+        (("limits", 0, 0), np.nan, "the limits of joint 'panda_joint1' are impossible"),
+        (("limits", 1, 0), -9.0, "the limits of joint 'panda_joint1' are impossible"),
+        (("limits", 2, 0), 0.0, "the limits of joint 'panda_joint1' are impossible"),
+        (("limits", 3, 0), np.nan, "the limits of joint 'panda_joint1' are impossible"),
+        (("links", 1, "mass"), -1.0, "expected a mass of zero or more"),
+        (("links", 1, "center"), [np.inf, 0, 0], "a finite centre"),
+        (("links", 1, "inertia"), [np.nan] * 9, "finite inertia"),
+        (("links", 1, "inertia"), [1, 0, 0, 1, 1, 0, 0, 0, 1], "symmetric inertia"),
+        (("links", 1, "inertia"), [-1, 0, 0, 0, 1, 0, 0, 0, 1], "negative principal moment"),
+    ],
+)
+def test_parts_of_impossible_numbers_are_refused(place_of_value: tuple, value: object, words: str) -> None:
+    parts = panda().to_parts()
+    Articulation.from_parts(parts)
+    *outer, last = place_of_value
+    inner = parts
+    for key in outer:
+        inner = inner[key]
+    inner[last] = value
+    with pytest.raises(ArgumentError, match=f"parts of an articulation: .*{words}"):
+        Articulation.from_parts(parts)
+
+
+def test_what_mimics_is_mimicked_by_none() -> None:
+    parts = panda().to_parts()
+    movable = [joint for joint in parts["joints"] if joint["index"] >= 0]
+    movable[1]["mimic"] = [0, 1, 0]
+    Articulation.from_parts(parts)
+    movable[2]["mimic"] = [1, 1, 0]
+    with pytest.raises(ArgumentError, match="'panda_joint3' mimics joint 1 of 9"):
+        Articulation.from_parts(parts)
+
+
+def test_descriptions_are_read_in_many_threads(tmp_path: Path) -> None:
+    (tmp_path / "r.urdf").write_text('<robot name="r"><link name="a"/></robot>')
+    code = """
+import sys, threading
+from wiw.physics import Articulation
+sys.setswitchinterval(1e-6)
+def read():
+    for _ in range(30):
+        kept = [Articulation("r.urdf") for _ in range(200)]
+threads = [threading.Thread(target=read) for _ in range(8)]
+for thread in threads: thread.start()
+for thread in threads: thread.join()"""
+    done = subprocess.run([sys.executable, "-c", code], cwd=tmp_path, capture_output=True, text=True, check=False)
+    assert done.returncode == 0, done.stderr

@@ -177,3 +177,13 @@ def test_images_without_a_pixel_are_refused(empty):
             batch.observations(np.zeros((1, *empty, 3), np.uint8), maker)
         with pytest.raises(ArgumentError, match="panorama size"):
             batch.views(PANORAMA[None], [np.zeros((1, 2, *empty, 3), np.uint8)], maker)
+
+
+def test_arrays_of_another_dtype_are_named_by_dtype_and_shape():
+    batch, maker = planner.Batch.build([[[1]]]), planner.ViewMaker("front", (8, 8))
+    with pytest.raises(ArgumentError, match=r"panoramas uint8 .*, got an episode's \[72, 128, 3\] float32"):
+        batch.views(PANORAMA[None].astype(np.float32), [], maker)
+    with pytest.raises(ArgumentError, match=r"rollouts uint8 .*, got \[1, 2, 72, 128, 3\] float64"):
+        batch.views(PANORAMA[None], [np.zeros((1, 2, 72, 128, 3))], maker)
+    with pytest.raises(ArgumentError, match=r"rollouts uint8 .*, got <class 'list'>"):
+        batch.views(PANORAMA[None], [[1]], maker)

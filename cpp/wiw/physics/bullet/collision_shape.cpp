@@ -5,6 +5,7 @@
 
 #include <cmath>
 
+#include "wiw/core/intrinsics.hpp"
 #include "wiw/physics/bullet/convert.hpp"
 
 namespace wiw::physics {
@@ -15,7 +16,6 @@ namespace {
 constexpr double kMargin = 1e-4;
 /// Cylinders are prisms to Bullet: flat faces stand firmly, where smooth ones touch in one wandering point.
 constexpr int kCylinderSides = 32;
-constexpr double kPi = 3.14159265358979323846;
 
 struct ToBulletShape {
   using Result = std::unique_ptr<btCollisionShape>;
@@ -25,21 +25,22 @@ struct ToBulletShape {
   }
   Result operator()(const Sphere& sphere) const { return std::make_unique<btSphereShape>(sphere.radius); }
   Result operator()(const Cylinder& cylinder) const {
-    ConvexHull prism;
+    std::vector<Eigen::Vector3d> prism;
     for (int i = 0; i < kCylinderSides; ++i) {
       const double angle = 2 * kPi * i / kCylinderSides;
       const double x = cylinder.radius * std::cos(angle), y = cylinder.radius * std::sin(angle);
-      prism.points.emplace_back(x, y, -cylinder.length / 2);
-      prism.points.emplace_back(x, y, cylinder.length / 2);
+      prism.emplace_back(x, y, -cylinder.length / 2);
+      prism.emplace_back(x, y, cylinder.length / 2);
     }
-    return (*this)(prism);
+    return of_vertices(thin_hull_mesh(prism).vertices);
   }
   Result operator()(const Capsule& capsule) const {
     return std::make_unique<btCapsuleShapeZ>(capsule.radius, capsule.length);
   }
-  Result operator()(const ConvexHull& hull) const {
+  Result operator()(const ConvexHull& hull) const { return of_vertices(hull_mesh(hull.points).vertices); }
+  static Result of_vertices(const std::vector<Eigen::Vector3d>& vertices) {
     auto shape = std::make_unique<btConvexHullShape>();
-    for (const Eigen::Vector3d& vertex : hull_mesh(hull.points).vertices) shape->addPoint(to_bullet(vertex), false);
+    for (const Eigen::Vector3d& vertex : vertices) shape->addPoint(to_bullet(vertex), false);
     shape->recalcLocalAabb();
     return finished(std::move(shape));
   }

@@ -106,14 +106,18 @@ class Writer {
   std::vector<std::uint8_t> table_;
 };
 
-/// A name beside `path` that no other writer uses.
+/// A name beside `path` that no other writer uses. Machines and containers that share the folder may have processes of
+/// the same number, hence the random bits.
 std::filesystem::path draft_of(const std::filesystem::path& path) {
   static std::atomic<unsigned> count = 0;
+  std::uint64_t random = 0;
+  const bool drawn = getentropy(&random, sizeof(random)) == 0;
   std::filesystem::path draft = path;
   draft += '.';
   draft += std::to_string(getpid());
   draft += '-';
   draft += std::to_string(count++);
+  if (drawn) draft += '-' + std::to_string(random);
   draft += ".tmp";
   return draft;
 }

@@ -7,6 +7,7 @@
 #include <charconv>
 #include <cstdint>
 #include <cstring>
+#include <optional>
 #include <set>
 #include <sstream>
 #include <string>
@@ -115,15 +116,24 @@ std::string_view take_token(std::string_view& line) {
   return token;
 }
 
-/// Whether a row has the entries that its lists announce: assimp takes memory for as many as are announced.
+/// A whole number of zero or more that is all of the token.
+std::optional<std::size_t> count_of(std::string_view token) {
+  std::size_t count = 0;
+  const auto [rest, error] = std::from_chars(token.data(), token.data() + token.size(), count);
+  if (error != std::errc() || rest != token.data() + token.size()) return std::nullopt;
+  return count;
+}
+
+/// Whether a row has all numbers, and the entries that its lists announce: assimp fills in what is missing from another
+/// row, and takes memory for as many entries as are announced.
 bool has_entries(const PlyElement& element, std::string_view line) {
   for (const PlyProperty& property : element.properties) {
     const std::string_view token = take_token(line);
+    if (token.empty()) return false;
     if (property.count_bytes == 0) continue;
-    std::size_t entries = 0;
-    const auto [rest, error] = std::from_chars(token.data(), token.data() + token.size(), entries);
-    if (error != std::errc() || rest != token.data() + token.size()) return false;
-    for (; entries > 0; --entries) {
+    const auto entries = count_of(token);
+    if (!entries) return false;
+    for (std::size_t i = 0; i < *entries; ++i) {
       if (take_token(line).empty()) return false;
     }
   }
@@ -150,14 +160,14 @@ bool has_plain_lines(std::string_view body) {
 }
 
 void check_ascii(const PlyHeader& header, std::string_view file, const std::string& path) {
-  std::size_t rows = 0;
-  for (const PlyElement& element : header.elements) rows += element.count;
   auto body = file.substr(header.bytes);
-  const auto lines =
-      static_cast<std::size_t>(std::ranges::count(body, '\n')) + (body.empty() || body.back() == '\n' ? 0 : 1);
-  if (rows > lines) {
-    throw FileError(
-        path, "should have " + std::to_string(rows) + " rows but has " + std::to_string(lines) + " (truncated file)");
+  auto lines = static_cast<std::size_t>(std::ranges::count(body, '\n')) + (body.empty() || body.back() == '\n' ? 0 : 1);
+  for (const PlyElement& element : header.elements) {
+    if (element.count > lines) {
+      throw FileError(path, "should have " + std::to_string(element.count) + " rows of the element '" + element.name +
+                                "' but has " + std::to_string(lines) + " left for them (truncated file)");
+    }
+    lines -= element.count;
   }
   if (!has_plain_lines(body)) throw FileError(path, "has bytes that no text has (damaged file)");
   for (const PlyElement& element : header.elements) {
@@ -192,8 +202,11 @@ PlyHeader read_ply_header(std::string_view file, const std::string& path) {
     if (word == "format") line >> header.format;
     if (word == "element") {
       PlyElement element;
-      if (!(line >> element.name >> element.count))
-        throw FileError(path, "has an <element> line without name and count (damaged file)");
+      std::string count;
+      line >> element.name >> count;
+      const auto rows = count_of(count);
+      if (!rows) throw FileError(path, "has an <element> line without name and count (damaged file)");
+      element.count = *rows;
       header.elements.push_back(std::move(element));
     }
     if (word == "property") {

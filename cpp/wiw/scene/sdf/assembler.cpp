@@ -6,6 +6,7 @@
 
 #include "wiw/core/error.hpp"
 #include "wiw/core/thread_pool.hpp"
+#include "wiw/scene/assemble.hpp"
 #include "wiw/scene/import/category.hpp"
 #include "wiw/scene/import/ceiling.hpp"
 #include "wiw/scene/import/extent.hpp"
@@ -71,14 +72,7 @@ void Assembler::load_parts() {
 }
 
 void Assembler::add_part(const std::filesystem::path& file, ScenePtr part) {
-  const auto first_texture = static_cast<std::int32_t>(scene_->textures.size());
-  const auto first_material = static_cast<std::int32_t>(scene_->materials.size());
-  scene_->textures.insert(scene_->textures.end(), part->textures.begin(), part->textures.end());
-  for (Material material : part->materials) {
-    if (material.texture != kNone) material.texture += first_texture;
-    scene_->materials.push_back(std::move(material));
-  }
-  scene_->warnings.insert(scene_->warnings.end(), part->warnings.begin(), part->warnings.end());
+  const std::int32_t first_material = add_appearance(*part, *scene_);
   parts_[file] = {std::move(part), first_material};
 }
 
