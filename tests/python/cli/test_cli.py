@@ -42,7 +42,7 @@ def test_help_teaches_by_examples(capsys):
         (["check-model"], "wiw check-model my_model.py:MyModel"),
         (["verify"], "--episodes 10"),
         (["export"], "--rerun first.rrd"),
-        ([], "75 stopped within 6 seconds by SIGTERM"),
+        ([], "75 stopped by SIGTERM or SIGUSR2"),
         (["scenes"], "apartments:val:4"),
         (["demo"], "oracle, a reference"),
         (["collect"], "--out demos --workers 4"),

@@ -67,7 +67,6 @@ def test_numbers_out_of_range_are_refused(
     [
         ("warpnet", "--categories", "chair"),
         ("warpnet", "--plays", "3"),
-        ("warpnet", "--decisions", "d"),
         ("warpnet", "--gpus", "2"),
         ("armnet", "--places", "3"),
         ("armnet", "--scenes", "apartments:train:1"),

@@ -12,6 +12,7 @@ import signal
 import sqlite3
 import subprocess
 import sys
+import time
 from collections.abc import Iterable, Iterator
 from contextlib import closing, contextmanager
 from pathlib import Path
@@ -479,7 +480,16 @@ def start_writer(tmp_path: Path, work: str, copying: float, **environment: str) 
         text=True,
     )
     assert process.stdout is not None and process.stdout.readline() == "begun\n"
+    if work == BUSY:
+        begun = read_cpu_ticks(process)
+        while read_cpu_ticks(process) < begun + 20:  # 0.2 s: it is in the call
+            time.sleep(0.01)
     return process
+
+
+def read_cpu_ticks(process: subprocess.Popen[str]) -> int:
+    """Return how long a process has computed, in hundredths of a second."""
+    return int(Path(f"/proc/{process.pid}/stat").read_text().rpartition(")")[2].split()[11])
 
 
 def test_a_stop_waits_for_the_store_to_be_copied(tmp_path: Path) -> None:

@@ -583,5 +583,5 @@ def test_shards_of_which_slurm_says_nothing_are_not_submitted_twice(tmp_path, sl
     assert submit(out, cluster="slurm", scenes="slow") == 0
     with pytest.raises(ArgumentError, match=r"job 70_0 of .* is UNKNOWN \(2 active in all\); .* remove .*jobs.json"):
         submit(out, "--debug", cluster="slurm", scenes="slow")
-    wait_for(lambda: len(list(out.glob("*/run.sqlite"))) == 2 and wiw.status(out).ended == 6)
+    wait_for(lambda: len(list(out.glob("*/run.sqlite"))) == 2 and wiw.status(out).ended == 6, 180)
     submitit.SlurmJob.watcher.clear()
