@@ -361,7 +361,7 @@ class _Claim(NamedTuple):
     begun: str
     """When its run began."""
     session: str | None = None
-    """What tells the process that has last begun to run its episodes, as JSON; None before the first."""
+    """The process that has last begun to run its episodes, as JSON; None before the first."""
     process: int | None = None
     host: str | None = None
     since: str | None = None

@@ -115,7 +115,7 @@ def _spread(specs: Sequence[tuple[str, str]], count: int) -> list[tuple[str, str
 
 @dataclass
 class _Cost:
-    """What was spent on samples: seconds of one core, and bytes."""
+    """The cost of samples: seconds of one core, and bytes."""
 
     opening: dict[bool, list[float]] = field(default_factory=lambda: {True: [], False: []})
     """Seconds of each scene that was opened, of apartments (True) and files."""
@@ -125,7 +125,7 @@ class _Cost:
     """Seconds for all `pictures`."""
     pictures: int = 0
     bytes: int = 0
-    """Of all pictures."""
+    """Size of all pictures."""
 
     def estimate_opening(self, specs: Sequence[str]) -> float:
         """Return the seconds that opening scenes takes, each as others of its kind that were opened."""

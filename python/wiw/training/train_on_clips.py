@@ -18,6 +18,7 @@ from wiw.datasets.navigation import NavigationData, Part
 from wiw.errors import ArgumentError, WeightsError
 from wiw.files import atomic_file
 from wiw.networks import describe_device, memory_guard, resolve_device
+from wiw.training.checkpoint import locate_checkpoint
 from wiw.training.held_out_clips import Frames, Imagine, imagine_with
 from wiw.training.learners import Learner, make_learner
 from wiw.training.place_trainer import PlaceTrainer
@@ -114,7 +115,7 @@ def train_on_clips(
     if out.exists():
         return _read_finished(learner, out, card)
     frames = reduce_frames(dataset, recipe.clip_size, cache, bar)
-    state = SignalledCheckpoint(out.with_name(f"{out.name}.checkpoint"), {"model": name, **card}, seconds)
+    state = SignalledCheckpoint(locate_checkpoint(out), {"model": name, **card}, seconds)
     remedies = f"lower batch (now {recipe.batch}), or choose a smaller size or network"
     with memory_guard(f"training {name} on {device}", remedies):
         trainer = learner.trainer(clips, frames, recipe, device)

@@ -16,6 +16,7 @@ from wiw.datasets.navigation import Part
 from wiw.errors import ArgumentError, FileError, TrainingError
 from wiw.files import atomic_file, atomic_folder
 from wiw.networks import memory_guard, resolve_device
+from wiw.training.checkpoint import locate_checkpoint
 from wiw.training.held_out_clips import Imagine
 from wiw.training.post_training import distributed
 from wiw.training.post_training.clip_trainer import ClipTrainer, arrange_clips
@@ -241,8 +242,7 @@ def _open_log(out: Path, tracker: str | None, recipe: ClipRecipe) -> TrainingLog
 
 def open_state(out: Path, identity: Mapping[str, Any], seconds: float) -> SignalledCheckpoint:
     """Return the state of a training, in `OUT.checkpoint`."""
-    path, shared = out.with_name(f"{out.name}.checkpoint"), distributed.count_processes() > 1
-    return SignalledCheckpoint(path, identity, seconds, shared=shared)
+    return SignalledCheckpoint(locate_checkpoint(out), identity, seconds, shared=distributed.count_processes() > 1)
 
 
 def locate_log(out: Path) -> Path:
