@@ -29,6 +29,7 @@ __all__ = [
     "TrainingError",
     "VlmError",
     "WeightsError",
+    "describe_exception",
     "find_error_class",
     "find_raising_line",
     "is_stop_request",
@@ -77,6 +78,16 @@ def read_text(error: BaseException) -> str:
         return " ".join(str(error).split())
     except Exception as fault:
         return f"its text cannot be had ({type(fault).__name__})"
+
+
+def describe_exception(error: BaseException, show_line: bool = False) -> str:
+    """Return, e.g., "ValueError: no (model.py, line 3)": also the place, and the line itself if `show_line`."""
+    said = f"{type(error).__name__}: {read_text(error)}"
+    place = find_raising_line(error)
+    if place is None:
+        return said
+    line = f": {place.line}" if show_line else ""
+    return f"{said} ({Path(place.filename).name}, line {place.lineno}{line})"
 
 
 def read_last_line(report: str) -> str:

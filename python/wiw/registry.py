@@ -29,7 +29,7 @@ from wiw.errors import (
     ConstructionError,
     Error,
     RegistryError,
-    find_raising_line,
+    describe_exception,
     is_stop_request,
     read_text,
 )
@@ -247,10 +247,10 @@ def _import_file(path: Path) -> Any:
 
 
 def _describe_error(error: BaseException) -> str:
-    """Return, e.g., "ImportError: no module (model.py, line 3)": also where it failed, which its text may not say."""
-    place = None if isinstance(error, SyntaxError | FileNotFoundError | AttributeError) else find_raising_line(error)
-    where = "" if place is None else f" ({Path(place.filename).name}, line {place.lineno})"
-    return f"{type(error).__name__}: {read_text(error)}{where}"
+    """Return the exception, and where it failed unless its text says so."""
+    if isinstance(error, SyntaxError | FileNotFoundError | AttributeError):
+        return f"{type(error).__name__}: {read_text(error)}"
+    return describe_exception(error)
 
 
 WORLD_MODELS = Registry(

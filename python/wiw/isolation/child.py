@@ -105,17 +105,10 @@ def _call(host: Host, body: bytes, arrays: list[NDArray[np.uint8]]) -> dict[str,
     except errors.Error as error:
         return {"error": {"type": type(error).__name__, "text": str(error), "kind": getattr(error, "kind", None)}}
     except Exception as error:
-        return {"error": {"type": "", "text": describe_exception(error)}}
+        return {"error": {"type": "", "text": errors.describe_exception(error)}}
     except BaseException as error:
         text = f"{error!r}, as if to end the process; a model that cannot answer should raise an Exception"
         return {"error": {"type": "ExitError", "text": text}}
-
-
-def describe_exception(error: BaseException) -> str:
-    """Return the type, the text and the place of an exception, e.g. "ValueError: no (model.py, line 3)"."""
-    place = errors.find_raising_line(error)
-    where = "" if place is None else f" ({Path(place.filename).name}, line {place.lineno})"
-    return f"{type(error).__name__}: {errors.read_text(error)}{where}"
 
 
 if __name__ == "__main__":

@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 
 from wiw import action
 from wiw.action import FORWARD, TURN_LEFT, TURN_RIGHT
-from wiw.errors import ArgumentError, ConstructionError, ContractError, find_raising_line, read_text
+from wiw.errors import ArgumentError, ConstructionError, ContractError, describe_exception
 from wiw.isolation.failures import EndedError, ExitError, LateError, RaisedError
 from wiw.loop.attempts import DEADLINE, make_model
 from wiw.loop.history import Frame, stack_histories
@@ -176,7 +176,7 @@ def examine_model(
         made = make_model(model, deadline, **options)
     except ConstructionError as error:
         cause = error.__cause__
-        text = f"{error}." if cause is None or error.kind == "deadline" else f"It cannot be built: {_locate(cause)}."
+        text = f"{error}." if cause is None or error.kind == "deadline" else f"It cannot be built: {_describe(cause)}."
         return _build_failed_checks(Finding(error.kind, text))
     if made is None:
         raise ArgumentError("check-model: 'none' stands for no world model; see `wiw list` for the available ones")
@@ -256,11 +256,11 @@ class _ModelExaminer:
             )
         except ExitError as error:
             cause = error.__cause__
-            said = error if cause is None else _locate(cause)
+            said = error if cause is None else _describe(cause)
             text = f"`rollout` raised {said}. Raise an Exception to report an error."
             finding = Finding("raised", text)
         except Exception as error:
-            finding = Finding("raised", f"`rollout` raised {_locate(error)}.")
+            finding = Finding("raised", f"`rollout` raised {_describe(error)}.")
         where = finding.kind if finding.kind in CHECKS else PICTURES.get(finding.kind, name)
         if where != name:
             self._done[name] = Check(name)
@@ -464,7 +464,10 @@ class _ModelExaminer:
         try:
             json.dumps(self.model.describe())
         except Exception as error:
-            yield Finding("describe", f"`describe` does not return JSON for the run's record: {_locate(error)}.")
+            yield Finding(
+                "describe",
+                f"`describe` does not return JSON for the run's record: {_describe(error)}.",
+            )
         if self.accepts.cacheable and not self.model.fingerprint():
             yield Finding(
                 "version",
@@ -532,8 +535,6 @@ def _count_rows(off: NDArray[np.int16]) -> str:
     return f"{sum(bool(row.any()) for row in off)} of {len(off)} rows"
 
 
-def _locate(error: BaseException) -> str:
-    """Return the exception and its place: the last line outside libraries, which is the model's own."""
-    place = find_raising_line(error)
-    where = "" if place is None else f" ({Path(place.filename).name}, line {place.lineno}: {place.line})"
-    return f"{type(error).__name__}: {read_text(error)}{where}"
+def _describe(error: BaseException) -> str:
+    """Return the exception with the line that raised it, which is the model's own."""
+    return describe_exception(error, show_line=True)
