@@ -30,6 +30,8 @@ from wiw.world_models.base import Requirements
 
 Key = tuple[str, int]
 """Arm and index of an episode."""
+Repeat = tuple[Mapping[str, Any], Mapping[str, Any]]
+"""Outcomes of an episode in two stores."""
 _ABSENT = "absent"
 
 
@@ -71,6 +73,27 @@ class Merged:
         return "\n".join(lines)
 
 
+@dataclass(frozen=True)
+class _Part:
+    """A store to be merged, open only while it is read: a run may have more shards than a process may open files."""
+
+    path: Path
+    created: str
+    benchmark: int
+    info: Mapping[str, Any]
+
+    @classmethod
+    def of(cls, store: RunStore) -> _Part:
+        return cls(store.path, store.created, store.benchmark, store.info)
+
+    @property
+    def folder(self) -> Path:
+        return self.path.parent
+
+    def open(self) -> RunStore:
+        return RunStore.read(self.path)
+
+
 def merge(stores: Sequence[str | Path], out: str | Path, scratch: str | Path | None = None) -> Merged:
     """Merge the stores of shards, or of the same run in other places, into one run.
 
@@ -95,18 +118,14 @@ def merge(stores: Sequence[str | Path], out: str | Path, scratch: str | Path | N
             equality is guaranteed; `out` already holds another run.
         FileError: `out` or `scratch` cannot be written.
     """
-    with ExitStack() as stack:
-        parts = [stack.enter_context(RunStore.read(folder)) for folder in find_stores(stores)]
-        require_equal_manifests(parts)
-        takes, repeated, unlike = _choose_sources(parts)
-        local = stack.enter_context(make_local_folder(scratch))
-        created = min(part.created for part in parts)
-        first, version = parts[0], parts[0].wiw_version
-        place = stack.enter_context(_choose_place(out, parts, local))
-        target = RunStore.create(place, first.config, _merge_info(parts), first.episodes(), local, created, version)
+    parts = _read_parts(find_stores(stores))
+    takes, repeated, unlike = _choose_sources(parts)
+    with make_local_folder(scratch) as local, _choose_place(out, parts, local) as place:
+        target = _begin_merged(place, parts, local)
         try:
             for part, episodes in zip(parts, takes, strict=True):
-                target.take_episodes(part, episodes)
+                with part.open() as source:
+                    target.take_episodes(source, episodes)
             drop_spare_pictures(target)
             undrawn = _draw_pictures(target)
             left = {arm["name"]: len(target.pending(arm["name"])) for arm in target.config["arms"]}
@@ -116,6 +135,15 @@ def merge(stores: Sequence[str | Path], out: str | Path, scratch: str | Path | N
         _close_merged(target, out)
     pending = {arm: count for arm, count in left.items() if count}
     return Merged(Path(out), len(parts), sum(map(len, takes)), pending, repeated, tuple(unlike), undrawn)
+
+
+def _begin_merged(place: str | Path, parts: Sequence[_Part], local: Path) -> RunStore:
+    """Create a merged run without any ended episode, open for writing."""
+    created = min(part.created for part in parts)
+    with parts[0].open() as first:
+        return RunStore.create(
+            place, first.config, _merge_info(parts), first.episodes(), local, created, first.wiw_version
+        )
 
 
 def _close_merged(target: RunStore, out: str | Path) -> None:
@@ -134,7 +162,7 @@ def _close_merged(target: RunStore, out: str | Path) -> None:
 
 
 @contextmanager
-def _choose_place(out: str | Path, parts: Sequence[RunStore], local: Path) -> Iterator[str | Path]:
+def _choose_place(out: str | Path, parts: Sequence[_Part], local: Path) -> Iterator[str | Path]:
     """Yield where to write a merged run: `out`, or a folder whose store then replaces an earlier merge at `out`.
 
     Raises:
@@ -153,16 +181,16 @@ def _choose_place(out: str | Path, parts: Sequence[RunStore], local: Path) -> It
         replace_store_file(path, store_path(new))
 
 
-def _require_replaceable(out: str | Path, parts: Sequence[RunStore]) -> None:
+def _require_replaceable(out: str | Path, parts: Sequence[_Part]) -> None:
     """Check that nothing of a merged run would be lost if its shards were merged again."""
-    with RunStore.read(out) as old:
+    with RunStore.read(out) as old, parts[0].open() as first:
         info, marks = old.info, list_marks(old)
-        is_of_shards = "merged" in info and _read_manifest(old) == _read_manifest(parts[0])
+        is_of_shards = "merged" in info and _read_manifest(old) == _read_manifest(first)
     before = {(each["shard"], each["created"]) for each in info.get("merged", [])}
-    now = {(part.info.get("shard"), part.created) for part in parts if part.shard is not None}
+    now = {(part.info["shard"], part.created) for part in parts if part.info.get("shard") is not None}
     if not is_of_shards or not before <= now:
         why = "was not merged from these shards"
-    elif "session" in info or not marks <= set().union(*map(list_marks, parts)):
+    elif "session" in info or not marks <= set().union(*map(_list_part_marks, parts)):
         why = "was resumed or judged since it was merged, of which its shards know nothing"
     else:
         return
@@ -172,40 +200,56 @@ def _require_replaceable(out: str | Path, parts: Sequence[RunStore]) -> None:
     )
 
 
-def require_equal_manifests(stores: Sequence[RunStore]) -> None:
-    """Check that stores are of the same run: versions, task, seed, arms, episodes, scenes, source files, measurements.
+def _list_part_marks(part: _Part) -> set[tuple[str, str, int]]:
+    with part.open() as store:
+        return list_marks(store)
+
+
+def _read_parts(folders: Sequence[Path]) -> list[_Part]:
+    """Read what stores say of themselves, and check that they are of the same run.
+
+    That is: versions, task, seed, arms, episodes, scenes, source files, measurements; agents and where it was stopped.
 
     Raises:
         StoreError: two differ; says which ones, and how.
     """
-    first = stores[0]
-    manifest = _read_manifest(first)
-    for other in stores[1:]:
-        for place, here, there in _compare(manifest, _read_manifest(other), ""):
+    parts, manifest = list[_Part](), dict[str, Any]()
+    for folder in folders:
+        with RunStore.read(folder) as store:
+            own = _read_manifest(store)
+            parts.append(_Part.of(store))
+        manifest = manifest or own
+        for place, here, there in _compare(manifest, own, ""):
             raise StoreError(
-                f"{first.path.parent} and {other.path.parent} are not from the same run: {place}: {_show(here)} and "
+                f"{parts[0].folder} and {parts[-1].folder} are not from the same run: {place}: {_show(here)} and "
                 f"{_show(there)}; expected stores of one command that differ only in --shard"
             )
-    _require_one_stop(stores)
-    known: dict[str, tuple[Path, Any]] = {}  # by arm: a store has built the agents of those that it has begun
-    for store in stores:
-        for arm, agent in store.info.get("built", {}).items():
-            folder, own = known.setdefault(arm, (store.path.parent, agent))
+    _require_one_stop(parts)
+    _require_equal_agents(parts)
+    return parts
+
+
+def _require_equal_agents(parts: Sequence[_Part]) -> None:
+    """Check that all stores that have begun an arm have built the same agent for it."""
+    known: dict[str, tuple[Path, Any]] = {}
+    for part in parts:
+        for arm, agent in part.info.get("built", {}).items():
+            folder, own = known.setdefault(arm, (part.folder, agent))
             for place, here, there in _compare(own, agent, f"agent {arm}"):
                 raise StoreError(
-                    f"{folder} and {store.path.parent} had different agents: {place}: {_show(here)} and "
+                    f"{folder} and {part.folder} had different agents: {place}: {_show(here)} and "
                     f"{_show(there)}; expected the same weights and options everywhere"
                 )
 
 
-def _require_one_stop(stores: Sequence[RunStore]) -> None:
+def _require_one_stop(parts: Sequence[_Part]) -> None:
     """Check that all stores that a rule has stopped were stopped at the same look; others may not have got there."""
-    stopped = [store for store in stores if "stopped" in store.info]
+    stopped = [part for part in parts if "stopped" in part.info]
     for other in stopped[1:]:
         here, there = stopped[0].info["stopped"], other.info["stopped"]
         if here != there:
             raise StoreError(
-                f"{stopped[0].path.parent} and {other.path.parent} are of one run (--until) but stopped at different "
+                f"{stopped[0].folder} and {other.folder} are of one run (--until) but stopped at different "
                 f"looks: {here['why']}; and {there['why']}. Expected the same stop; find out which is right with "
                 "`wiw verify`, and merge without the other"
             )
@@ -239,31 +283,51 @@ def _show(value: Any, most: int = 120) -> str:
     return text if len(text) <= most else f"{text[: most - 1]}…"
 
 
-def _choose_sources(parts: Sequence[RunStore]) -> tuple[list[set[Key]], int, list[str]]:
+def _choose_sources(parts: Sequence[_Part]) -> tuple[list[set[Key]], int, list[str]]:
     """Return the episodes to take from each store, the number of repeated ones, and those with unlike records."""
     found: dict[Key, list[tuple[int, Mapping[str, Any]]]] = {}
     for index, part in enumerate(parts):
-        for row in part.recorded_outcomes():
-            found.setdefault((row["arm"], row["episode"]), []).append((index, row))
-    takes, repeated, unlike = [set[Key]() for _ in parts], 0, list[str]()
+        with part.open() as store:
+            for outcome in store.recorded_outcomes():
+                found.setdefault((outcome["arm"], outcome["episode"]), []).append((index, outcome))
+    takes, repeats = [set[Key]() for _ in parts], dict[tuple[int, int], list[Repeat]]()
     for key, records in found.items():
-        done = [record for record in records if record[1]["status"] == "done"] or records[:1]
-        takes[done[0][0]].add(key)
-        differences = [text for other in done[1:] if (text := _find_difference(parts, done[0], other))]
-        unlike += differences[:1]
-        repeated += len(done) > 1 and not differences
-    return takes, repeated, unlike
+        (first, row), *others = [record for record in records if record[1]["status"] == "done"] or records[:1]
+        takes[first].add(key)
+        for other, row_there in others:
+            repeats.setdefault((first, other), []).append((row, row_there))
+    repeated = {(row["arm"], row["episode"]) for rows in repeats.values() for row, _ in rows}
+    differences = _list_differences(parts, repeats)
+    return takes, len(repeated - differences.keys()), [differences[key] for key in found if key in differences]
+
+
+def _list_differences(parts: Sequence[_Part], repeats: Mapping[tuple[int, int], Sequence[Repeat]]) -> dict[Key, str]:
+    """Return the first difference between the records of each repeated episode that has several.
+
+    Args:
+        parts: the stores.
+        repeats: by the places of two stores among these, the outcomes of the episodes to compare.
+
+    Raises:
+        StoreError: records differ although equality is guaranteed.
+    """
+    found: dict[Key, str] = {}
+    for first, other in sorted(repeats):
+        with parts[first].open() as store, parts[other].open() as store_there:
+            for row, row_there in repeats[first, other]:
+                if text := _find_difference(store, row, store_there, row_there):
+                    found.setdefault((row["arm"], row["episode"]), text)
+    return found
 
 
 def _find_difference(
-    parts: Sequence[RunStore], first: tuple[int, Mapping[str, Any]], other: tuple[int, Mapping[str, Any]]
+    store: RunStore, row: Mapping[str, Any], store_there: RunStore, row_there: Mapping[str, Any]
 ) -> str:
     """Return the first difference between two records of an episode; empty if they are equal.
 
     Raises:
         StoreError: they differ although equality is guaranteed.
     """
-    (store, row), (store_there, row_there) = ((parts[index], row) for index, row in (first, other))
     facts, facts_there = read_facts(store, row), read_facts(store_there, row_there)
     text = next(list_differences(facts, facts_there), "")
     if text and _is_promised(store, row["arm"], facts) and store.info["platform"] == store_there.info["platform"]:
@@ -293,7 +357,7 @@ def _needs_nothing(model: str | None) -> bool:
     return isfunction(found) or (found is not None and found.requires == Requirements())
 
 
-def _merge_info(parts: Sequence[RunStore]) -> dict[str, Any]:
+def _merge_info(parts: Sequence[_Part]) -> dict[str, Any]:
     """Return the first store's info for the whole run, with the origin of each part."""
     infos = [part.info for part in parts]
     named = ("shard", "platform", "command", "preparation_seconds", "session")
@@ -303,7 +367,7 @@ def _merge_info(parts: Sequence[RunStore]) -> dict[str, Any]:
     info["benchmark"] = parts[0].benchmark
     info["preparation_seconds"] = sum(own.get("preparation_seconds", 0.0) for own in infos)
     info["merged"] = [
-        {"store": str(part.path.parent), "created": part.created, **{name: own.get(name) for name in named}}
+        {"store": str(part.folder), "created": part.created, **{name: own.get(name) for name in named}}
         for part, own in zip(parts, infos, strict=True)
     ]
     return info

@@ -25,9 +25,11 @@ def spread_evenly(episodes: Sequence[Episode], count: int) -> list[int]:
     """Return `count` indices spread evenly over the episodes, and the first of each group that has none among them."""
     count, last = min(count, len(episodes)), len(episodes) - 1
     chosen = {round(i * last / max(1, count - 1)) for i in range(count)}
+    groups = {episodes[index].group for index in chosen}
     for index, episode in enumerate(episodes):
-        if count and episode.group not in {episodes[other].group for other in chosen}:
+        if count and episode.group not in groups:
             chosen.add(index)
+            groups.add(episode.group)
     return sorted(chosen)
 
 
@@ -52,9 +54,12 @@ def choose_episodes(
     are `controls` count for nothing.
     """
     chosen = spread_evenly(episodes[: max(pool, default=-1) + 1], count)
-    rated = [row for row in outcomes if row["arm"] not in controls]
-    gains = {index: _rate_gain(index, rated) for index in {*pool, *chosen}}
-    best = max(sorted(gains), key=lambda index: (gains[index], index in chosen), default=None)
+    found: dict[int, dict[str, bool]] = {index: {} for index in sorted({*pool, *chosen})}
+    for row in outcomes:
+        if row["episode"] in found and row["status"] == "done" and row["arm"] not in controls:
+            found[row["episode"]][row["arm"]] = is_success(row["metrics"])
+    gains, spread = {index: _rate_gain(success) for index, success in found.items()}, set(chosen)
+    best = max(gains, key=lambda index: (gains[index], index in spread), default=None)
     if best is None or gains[best] == (0, 0):
         return chosen
     rivals = [index for index in chosen if episodes[index].group == episodes[best].group]
@@ -81,13 +86,12 @@ def drop_spare_pictures(store: RunStore) -> None:
     store.keep_pictures(choose_pictured_episodes(store))
 
 
-def _rate_gain(index: int, outcomes: Sequence[Mapping[str, Any]]) -> tuple[int, int]:
-    """Return how many models, and whether the ceiling, succeed in an episode in which the floor fails."""
-    success = {
-        row["arm"]: is_success(row["metrics"])
-        for row in outcomes
-        if row["episode"] == index and row["status"] == "done"
-    }
+def _rate_gain(success: Mapping[str, bool]) -> tuple[int, int]:
+    """Return how many models, and whether the ceiling, succeed in an episode in which the floor fails.
+
+    Args:
+        success: of the episode, by arm.
+    """
     floor = next((success[arm] for arm in FLOORS if arm in success), True)
     if floor:
         return 0, 0

@@ -66,6 +66,11 @@ DECISION_JSON = (
 """Columns of table `decision` that hold JSON."""
 OUTCOME_JSON = ("metrics", "details")
 """Columns of table `outcome` that hold JSON."""
+_ENDED = {
+    **dict.fromkeys(("outcome", "decision", "image", "film"), "arm = ? AND episode = ?"),
+    "judged": "judge IN (SELECT digest FROM judge) AND arm = ? AND episode = ?",
+}
+"""Tables with the rows of an ended episode, and the condition by which SQLite finds them with their primary key."""
 APPLICATION_ID = 0x77697721
 """Marks the file as a run store (SQLite's application_id)."""
 
@@ -497,10 +502,12 @@ class RunStore:
 
     def decisions(self, arm: str | None = None, episode: int | None = None) -> list[dict[str, Any]]:
         """Return the decisions of ended episodes in order, of all or of one arm or episode."""
+        chosen = {name: value for name, value in (("arm", arm), ("episode", episode)) if value is not None}
+        condition = " AND ".join(f"{name} = ?" for name in chosen) or "true"  # nothing else lets SQLite use the key
         rows = self._rows(
-            "SELECT d.* FROM decision d JOIN outcome USING (arm, episode) WHERE (? IS NULL OR arm = ?) "
-            "AND (? IS NULL OR episode = ?) ORDER BY arm, episode, decision",
-            (arm, arm, episode, episode),
+            f"SELECT d.* FROM decision d JOIN outcome USING (arm, episode) WHERE {condition} "
+            "ORDER BY arm, episode, decision",
+            tuple(chosen.values()),
         )
         for row in self._convert_types("decision", rows):
             for column in DECISION_JSON:
@@ -743,9 +750,9 @@ class RunStore:
         with self._writing() as connection:
             for row in source._rows("SELECT * FROM judge"):
                 connection.execute("INSERT OR IGNORE INTO judge VALUES (?, ?, ?)", tuple(row.values()))
-            for table in ("outcome", "decision", "image", "film", "judged"):
+            for table, key in _ENDED.items():
                 for own in episodes:
-                    for row in source._rows(f"SELECT * FROM {table} WHERE arm = ? AND episode = ?", own):
+                    for row in source._rows(f"SELECT * FROM {table} WHERE {key}", own):
                         _insert(connection, table, row)
             for row in source._rows("SELECT episode, geodesic FROM episode WHERE geodesic IS NOT NULL"):
                 connection.execute(
@@ -781,7 +788,7 @@ class RunStore:
             for episode in episodes:
                 _forget(connection, "d.arm = ? AND d.episode = ?", (arm, episode))
                 for table in ("outcome", "judged"):
-                    connection.execute(f"DELETE FROM {table} WHERE arm = ? AND episode = ?", (arm, episode))
+                    connection.execute(f"DELETE FROM {table} WHERE {_ENDED[table]}", (arm, episode))
 
     def keep_pictures(self, episodes: Sequence[int]) -> None:
         """Drop the pictures of all other episodes; `info["pictures"]` has these, the one to show first in front."""

@@ -14,7 +14,7 @@ from typing import Any, NamedTuple
 
 from wiw.errors import StoreError
 from wiw.file_systems import find_network
-from wiw.runs.faults import explain_faults
+from wiw.runs.faults import explain_faults, explain_shortage
 from wiw.runs.scratch import ScratchCopy
 from wiw.runs.store_log import has_log
 
@@ -144,10 +144,10 @@ def lock_store(path: Path) -> Any:
     try:
         handle = path.with_suffix(".lock").open("w")
     except OSError as error:
-        raise StoreError(
-            f"cannot write to the run's folder {path.parent} ({error.strerror}); expected a writable folder with free "
-            "space: make room, or choose another with out= or --out"
-        ) from error
+        remedy = explain_shortage() or (
+            "expected a writable folder with free space: make room, or choose another with out= or --out"
+        )
+        raise StoreError(f"cannot write to the run's folder {path.parent} ({error.strerror}); {remedy}") from error
     try:
         fcntl.flock(handle, fcntl.LOCK_EX | fcntl.LOCK_NB)
     except OSError:

@@ -10,7 +10,6 @@ from __future__ import annotations
 
 import json
 from collections.abc import Callable, Mapping, Sequence
-from contextlib import ExitStack
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -26,7 +25,6 @@ from wiw.runs.rows import to_json
 from wiw.runs.shards import Shard
 from wiw.runs.store import RunStore
 from wiw.studies.evaluate import evaluate
-from wiw.studies.run_log import load_run
 from wiw.types import PRIMITIVES
 
 TASKS = ("imagenav", "ar", "aeqa", "manipulation")
@@ -357,24 +355,33 @@ def _read_task(
     """Return the numbers of a task from its runs, which may be unfinished.
 
     Success is taken from the runs in `parts`, distances and regret from those in `measured`, mostly the same. None
-    until an episode has been scored without imagination, with true futures and in an arm with an error.
+    until an episode has been scored without imagination, with true futures and in an arm with an error. One run is open
+    at a time, for a study may have more than a process may open files.
     """
-    with ExitStack() as stack:
-        logs = {path: load_run(path) for path in dict.fromkeys((*parts, *measured))}
-        for log in logs.values():
-            stack.callback(log.close)
-        outcomes = [row for path in parts for row in logs[path].store.outcomes()]
-        scored = {row["arm"] for row in outcomes if row["status"] == "done"}
-        shown = settings.list_arms(task)
-        if not {FLOOR, CEILING} <= scored or scored.isdisjoint(shown):
-            return None
-        return summarise_errors(
-            task,
-            logs[parts[0]].store.info["agents"][CEILING]["policy"],
-            outcomes,
-            (row for path in measured for row in logs[path].store.decisions()),
-            shown,
-            settings.list_left_out(task),
-            settings.seed,
-            others=sorted(scored - {FLOOR, CEILING, *shown}),
-        )
+    outcomes = [row for path in parts for row in _read_outcomes(path)]
+    scored = {row["arm"] for row in outcomes if row["status"] == "done"}
+    shown = settings.list_arms(task)
+    if not {FLOOR, CEILING} <= scored or scored.isdisjoint(shown):
+        return None
+    with RunStore.read(parts[0]) as first:
+        policy = first.info["agents"][CEILING]["policy"]
+    return summarise_errors(
+        task,
+        policy,
+        outcomes,
+        (row for path in measured for row in _read_decisions(path)),
+        shown,
+        settings.list_left_out(task),
+        settings.seed,
+        others=sorted(scored - {FLOOR, CEILING, *shown}),
+    )
+
+
+def _read_outcomes(run: Path) -> list[dict[str, Any]]:
+    with RunStore.read(run) as store:
+        return store.outcomes()
+
+
+def _read_decisions(run: Path) -> list[dict[str, Any]]:
+    with RunStore.read(run) as store:
+        return store.decisions()

@@ -27,6 +27,8 @@ from wiw.tasks.answer_record import AnswerRecord, read_judgements
 
 SERVER_ERRORS = 5
 """Consecutive answers for which the language model could not be reached, after which no more are requested."""
+Key = tuple[str, int]
+"""Arm and index of an episode."""
 Item = tuple[int, str]
 """Episode and answer: equal answers by several arms to one question are judged once."""
 
@@ -109,11 +111,11 @@ class _JudgingPass:
         marked = {key for key, row in judged.items() if row["status"] == "done"}
         if self.judge.own:
             marked |= {key for key, (row, _) in self._records.items() if row["status"] == "done"}
-        self._left = [key for key in self._records if key not in marked]
+        self._left = [key for key in self._records if key not in marked]  # what this pass is to mark
         self._found: dict[Item, Judgement | Exception] = dict(self._read_known(judged))
         self.known_before = len(self._found)
 
-    def _read_known(self, judged: Mapping[tuple[str, int], Mapping[str, Any]]) -> Iterator[tuple[Item, Judgement]]:
+    def _read_known(self, judged: Mapping[Key, Mapping[str, Any]]) -> Iterator[tuple[Item, Judgement]]:
         """Yield the judge's stored marks, including those of episodes with another answer missing."""
         rows = [(episode, row["details"]) for (_, episode), row in judged.items()]
         if self.judge.own:
@@ -126,18 +128,18 @@ class _JudgingPass:
         """Judge what is missing, and write each outcome as soon as its answers are judged."""
         wanted = {(key[1], answer): None for key in self._left for answer in self._records[key][1].answers}
         items = [item for item in wanted if item not in self._found]
-        if self._left:
+        if self._left or not self.judge.own:  # its marks can be read as soon as it is known, also while there are none
             self._store.add_judge(self.judge)
         state = AnswerProgress(self.known_before + len(items), self.known_before)
         board = make_board(progress and bool(items))
         try:
             board.show(self.judge.name, state)
-            self._write_ready()
+            left = _group_by_episode(self._write_ready(self._left))
             for item, outcome in self._ask(items):
                 self._found[item] = outcome
                 self.asked += 1
                 state.ended, state.errors = state.ended + 1, state.errors + isinstance(outcome, Exception)
-                self._write_ready(item[0])
+                left[item[0]] = self._write_ready(left[item[0]])
                 board.show(self.judge.name, state)
         finally:
             board.close()
@@ -165,19 +167,18 @@ class _JudgingPass:
         finally:
             pool.shutdown(wait=False, cancel_futures=True)
 
-    def _write_ready(self, episode: int | None = None) -> None:
-        """Write the outcomes (of an episode) whose answers have all been judged, or could not be."""
+    def _write_ready(self, keys: Sequence[Key]) -> list[Key]:
+        """Write the outcomes whose answers have all been judged, or could not be; return the others."""
         left = []
-        for key in self._left:
+        for key in keys:
             record = self._records[key][1]
-            ready = episode in (None, key[1]) and all((key[1], answer) in self._found for answer in record.answers)
-            if ready:
+            if all((key[1], answer) in self._found for answer in record.answers):
                 self._store.write_judged(self._make_row(key, record))
             else:
                 left.append(key)
-        self._left = left
+        return left
 
-    def _make_row(self, key: tuple[str, int], record: AnswerRecord) -> JudgedRow:
+    def _make_row(self, key: Key, record: AnswerRecord) -> JudgedRow:
         found = {answer: self._found[key[1], answer] for answer in record.answers}
         judgements = {answer: each for answer, each in found.items() if isinstance(each, Judgement)}
         errors = [each for each in found.values() if isinstance(each, Exception)]
@@ -200,7 +201,14 @@ class _JudgingPass:
                 yield MissingMarks(arm, episode, found["error"], found["kind"])
 
 
-def read_answers(store: RunStore) -> dict[tuple[str, int], tuple[dict[str, Any], AnswerRecord]]:
+def _group_by_episode(keys: Sequence[Key]) -> dict[int, list[Key]]:
+    found: dict[int, list[Key]] = {}
+    for key in keys:
+        found.setdefault(key[1], []).append(key)
+    return found
+
+
+def read_answers(store: RunStore) -> dict[Key, tuple[dict[str, Any], AnswerRecord]]:
     """Return the outcomes of a run that can be judged, each with its answers, by arm and episode.
 
     Raises:

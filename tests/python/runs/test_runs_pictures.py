@@ -15,6 +15,7 @@ from wiw.runs.pictures import choose_episodes, choose_pictured_episodes, pool_ep
 from wiw.runs.store import RunStore
 from wiw.runs.store_file import store_path
 from wiw.studies.evaluate import run_arms
+from wiw.types import Episode
 
 EPISODES = LineTask().episodes(40)
 
@@ -62,6 +63,29 @@ def test_every_kind_keeps_an_episode():
 def test_a_pool_holds_the_even_choice():
     assert len(pool_episodes(EPISODES, 2)) == 12 and {0, 39} <= set(pool_episodes(EPISODES, 2))
     assert pool_episodes(EPISODES, 0) == [] and pool_episodes(EPISODES, 40) == list(range(40))
+
+
+class Counted(dict):
+    """A row that counts how often rows are read."""
+
+    reads = 0
+
+    def __getitem__(self, name):
+        Counted.reads += 1
+        return super().__getitem__(name)
+
+
+def test_each_episode_and_each_outcome_is_looked_at_a_few_times_however_many_there_are(monkeypatch):
+    count, group, looks = 300, Episode.group.fget, []
+    monkeypatch.setattr(Counted, "reads", 0)
+    episodes = LineTask().episodes(count)
+    monkeypatch.setattr(Episode, "group", property(lambda own: looks.append(own) or group(own)))
+    assert len(pool_episodes(episodes, count)) == count and len(looks) <= 6 * count
+    rows = [
+        Counted(arm=arm, episode=i, status="done", metrics={"success": 0.0}) for arm in AGENTS for i in range(count)
+    ]
+    assert choose_episodes(episodes, range(count), rows, count) == list(range(count))
+    assert Counted.reads <= 6 * len(rows)
 
 
 AGENTS = {"none": LineAgent(0.35), "copy": LineAgent(0.3), "warp": LineAgent(0.75)}

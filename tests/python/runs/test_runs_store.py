@@ -5,6 +5,8 @@ import json
 import math
 import re
 import sqlite3
+import subprocess
+import sys
 from contextlib import closing
 from dataclasses import replace
 
@@ -387,3 +389,56 @@ def test_jpeg_keeps_colour_order():
 def test_queries_number_no_placeholders() -> None:
     """From Python 3.14 on, sqlite3 refuses them beside a sequence of values."""
     assert not re.findall(r"\?\d", inspect.getsource(store_module))
+
+
+def list_plans(store, use):
+    """Return how SQLite finds the rows of tables in each statement about one episode that `use` makes."""
+    statements = []
+    store._connection.set_trace_callback(statements.append)
+    use()
+    store._connection.set_trace_callback(None)
+    return [
+        step["detail"]
+        for statement in statements
+        if "episode = " in statement
+        for step in store._connection.execute(f"EXPLAIN QUERY PLAN {statement}", [0] * statement.count("?"))
+        if step["detail"].startswith(("SCAN", "SEARCH")) and "VIRTUAL TABLE" not in step["detail"]
+    ]
+
+
+def test_the_rows_of_an_episode_are_found_by_key_and_not_by_reading_the_table(run, tmp_path):
+    with RunStore.create(tmp_path / "other", CONFIG, INFO, LineTask().episodes(3)) as other:
+        for use in (
+            lambda: run.decisions("warp", 0),
+            lambda: run.images("warp", 0, 0),
+            lambda: run.film("warp", 0),
+            lambda: other.take_episodes(run, [("warp", 0)]),
+            lambda: run.discard("warp", [0]),
+        ):
+            plans = list_plans(run, use)
+            assert plans and all(plan.startswith("SEARCH") for plan in plans), plans
+
+
+FULL = """
+import os, resource
+from wiw.errors import StoreError
+from wiw.runs.store import RunStore
+opened = [RunStore.read(RUN)]
+resource.setrlimit(resource.RLIMIT_NOFILE, (len(os.listdir("/proc/self/fd")) + 12,) * 2)
+for open_store in (RunStore.read, RunStore.annotate):
+    try:
+        while True:
+            opened.append(open_store(RUN))
+    except StoreError as error:
+        print(error)
+"""
+
+
+def test_a_process_that_may_open_no_more_files_is_told_so(run):
+    program = FULL.replace("RUN", repr(str(run.path.parent)))
+    run.close()
+    shown = subprocess.run([sys.executable, "-c", program], check=True, capture_output=True, text=True).stdout
+    read, annotated = shown.splitlines()
+    assert "unable to open" in read and "cannot write" in annotated
+    for said in (read, annotated):
+        assert re.search(r"as many open as it may, \d+\..* `ulimit -n \d+`", said) and "make room" not in said

@@ -569,3 +569,28 @@ def test_stores_that_are_still_written_can_be_merged(tmp_path):
     with RunStore.resume(tmp_path / "parts/1") as store:
         store.discard("none", [0])  # is run again just now
         assert dict(wiw.merge([tmp_path / "parts"], tmp_path / "merged").pending) == {"none": 1}
+
+
+MERGE = """
+import os, resource, sys
+import wiw
+resource.setrlimit(resource.RLIMIT_NOFILE, (len(os.listdir("/proc/self/fd")) + 30,) * 2)
+print(wiw.merge([sys.argv[1]], sys.argv[2]).repeated)
+"""
+
+
+def test_a_run_has_more_stores_than_a_process_may_open_files(tmp_path):
+    (first,) = run_shards(tmp_path / "parts", 1, episodes=2)
+    for number in range(2, 41):
+        shutil.copytree(first, first.with_name(str(number)))
+    done = subprocess.run(
+        [sys.executable, "-c", MERGE, tmp_path / "parts", tmp_path / "merged"],
+        check=False,
+        capture_output=True,
+        text=True,
+        timeout=100,
+    )
+    assert done.stdout == "2\n", done.stderr
+    (rows, config), (one, same) = read_rows(tmp_path / "merged"), read_rows(first)
+    assert rows.pop("lost") != one.pop("lost"), "what the other copies cost"
+    assert (rows, config) == (one, same)

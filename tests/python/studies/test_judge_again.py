@@ -21,6 +21,7 @@ from wiw.errors import ArgumentError, StoreError, VlmError
 from wiw.judging import Judge, Judgement
 from wiw.runs.store import RunStore
 from wiw.serving.vlm_server import VlmServer
+from wiw.studies.judge import read_answers
 from wiw.studies.run_log import load_run
 from wiw.vlm.messages import Call, Completion
 from wiw.vlm.mock import MockClient
@@ -255,6 +256,50 @@ def test_a_task_that_is_not_known_here_cannot_be_judged(run: Path) -> None:
         connection.execute("UPDATE run SET config = json_set(config, '$.task.task', 'mine')")
     with pytest.raises(StoreError, match="task in memory, 'mine', that is not registered"):
         wiw.judge(run, progress=False)
+
+
+@pytest.mark.parametrize(
+    "change",
+    [
+        "DELETE FROM outcome",
+        "UPDATE outcome SET status = 'error', error = 'lost', kind = 'agent', metrics = '{}', details = '{}'",
+    ],
+    ids=["just begun", "errors alone"],
+)
+def test_a_run_without_a_finished_episode_is_shown_without_marks(
+    run: Path, change: str, capsys: pytest.CaptureFixture[str]
+) -> None:
+    with RunStore.annotate(run) as store, store._writing() as connection:
+        connection.execute(change)
+    found = wiw.judge(run, Grumpy(), progress=False)
+    assert (found.asked, found.known, found.complete) == (0, 0, True)
+    assert len(found.log.episodes) == len(load_run(run, judge="grumpy").episodes) == (0 if "DELETE" in change else 6)
+    assert main(["judge", str(run), "--judge", "approximate"]) == 0
+    assert "0 judged now, 0 judged before" in capsys.readouterr().out
+
+
+class Counted(dict[Any, Any]):
+    """Answers that count how often they are read."""
+
+    reads = 0
+
+    def __getitem__(self, key: Any) -> Any:
+        self.reads += 1
+        return super().__getitem__(key)
+
+
+def test_each_answer_is_looked_at_a_few_times_however_many_there_are(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    count = 60
+    questions = [free_question(f"reason {index}") for index in range(count)]
+    arms = {arm: [Ended(f"guess {index}") for index in range(count)] for arm in ("none", "warp")}
+    run = write_run(tmp_path / "run", make_episodes(questions, [f"s{index}" for index in range(count)]), arms)
+    with RunStore.read(run) as store:
+        answers = Counted(read_answers(store))
+    monkeypatch.setattr("wiw.studies.judge.read_answers", lambda store: answers)
+    assert wiw.judge(run, Grumpy(), progress=False).complete
+    assert answers.reads <= 8 * len(answers)
 
 
 def test_a_run_that_is_being_written_is_left_alone(run: Path) -> None:

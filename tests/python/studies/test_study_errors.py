@@ -4,11 +4,15 @@
 from __future__ import annotations
 
 import json
+import shutil
+import subprocess
+import sys
 from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import pytest
+from fakes import LineTask
 
 from wiw.analysis.errors import METRES, summarise_errors
 from wiw.analysis.intervals import clustered_interval
@@ -27,8 +31,10 @@ from wiw.report.error_tables import (
     list_titles,
     print_errors,
 )
+from wiw.runs.rows import OutcomeRow
+from wiw.runs.store import RunStore
 from wiw.studies.errors import SMALL, ErrorSettings, make_recipes, read_errors, study_errors
-from wiw.types import PRIMITIVES
+from wiw.types import PRIMITIVES, EpisodeResult
 
 ARMS = {"error-blur@64": ("blur", 64.0), "error-lag@2": ("lag", 2.0), "error-lag@4": ("lag", 4.0)}
 DISTANCE = {"error-blur@64": 0.5, "error-lag@2": 0.2, "error-lag@4": 0.4}
@@ -341,3 +347,37 @@ def test_distances_of_few_episodes_go_with_the_success_of_many(two_rooms: str, t
     with pytest.raises(StoreError, match="has no run of imagenav"):
         study_errors(tmp_path / "new", many, distances=tmp_path)
     assert not (tmp_path / "new").exists(), "nothing was run before"
+
+
+READ = """
+import os, resource, sys
+from wiw.studies.errors import ErrorSettings, read_errors
+resource.setrlimit(resource.RLIMIT_NOFILE, (len(os.listdir("/proc/self/fd")) + 30,) * 2)
+print(read_errors(sys.argv[1], ErrorSettings(tasks=("imagenav",))).to_json())
+"""
+
+
+def write_part(folder: Path) -> None:
+    """Write a part of a study in which every arm has ended four episodes."""
+    arms = ("none", "oracle", *ARMS)
+    agents = {arm: {"policy": "matcher", "model_options": {}} for arm in arms}
+    config = {"task": {}, "seed": 0, "episodes": 4, "arms": [{"name": arm, "agent": agents[arm]} for arm in arms]}
+    info = {"task": {"name": "imagenav", "options": {}}, "agents": agents, "limits": {"fidelity_share": 0.25}}
+    info |= {"pictures": [], "live": 1, "workers": 1}
+    with RunStore.create(folder, config, info, LineTask().episodes(4)) as store:
+        for row in outcomes():
+            if (index := row["episode"]) < 4:
+                result = EpisodeResult(index, str(index), row["scene"], "done", row["metrics"], 1.0)
+                store.write(OutcomeRow(row["arm"], result))
+
+
+def test_a_study_has_more_parts_than_a_process_may_open_files(tmp_path: Path) -> None:
+    first = tmp_path / "imagenav" / "shard-1-of-40"
+    write_part(first)
+    for number in range(2, 41):
+        shutil.copytree(first, first.with_name(f"shard-{number}-of-40"))
+    done = subprocess.run(
+        [sys.executable, "-c", READ, tmp_path], check=False, capture_output=True, text=True, timeout=100
+    )
+    assert done.returncode == 0, done.stderr
+    assert json.loads(done.stdout)["tasks"][0]["episodes"] == 4
