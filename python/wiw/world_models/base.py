@@ -303,6 +303,13 @@ def find_accepts(model: Any) -> Accepts | None:
     return declared if isinstance(declared, Accepts) else None
 
 
+class _Signature:
+    """What the class of a model takes: nothing where it has no constructor, though `__new__` would take anything."""
+
+    def __get__(self, instance: Any, owner: type[Any]) -> inspect.Signature | None:
+        return inspect.Signature() if owner.__init__ is object.__init__ else None
+
+
 class WorldModel(ABC):
     """Predicts what an agent would see. Subclasses set `accepts` and implement `rollout`."""
 
@@ -315,6 +322,7 @@ class WorldModel(ABC):
     requires: ClassVar[Requirements] = Requirements()
     credits: float | None = None
     """Credits that a paid service has charged so far; None if imagining is free."""
+    __signature__ = _Signature()
 
     def __init_subclass__(cls, **kwargs: Any) -> None:
         super().__init_subclass__(**kwargs)
@@ -327,8 +335,11 @@ class WorldModel(ABC):
 
         Raises:
             ContractError: the class leaves its declaration to classes derived from it.
+            TypeError: there are arguments, and the class has no constructor.
         """
         cls._require_declaration()
+        if (args or kwargs) and cls.__init__ is object.__init__:
+            raise TypeError(f"{cls.__name__}() takes no arguments")
         made = super().__new__(cls)
         if not cls.__module__.startswith("wiw."):
             made._constructed_with = _list_arguments(cls, args, kwargs)

@@ -198,3 +198,27 @@ def test_a_base_of_world_models_leaves_the_declaration_to_others(tmp_path: Path,
     assert make(f"{file}:Mine").accepts.control == "image"
     with pytest.raises(ContractError, match=r"Base: expected the class attribute `accepts = wiw\.accepts\(\.\.\.\)`"):
         make(f"{file}:Base")
+
+
+OPTIONS = (
+    BASE
+    + """
+
+class Sized(Mine):
+    def __init__(self, size=8):
+        self.size = size
+"""
+)
+
+
+@pytest.mark.parametrize("make", [wiw.world_model, WORLD_MODELS.make_here])
+def test_a_model_without_a_constructor_takes_no_options(tmp_path: Path, make: Any) -> None:
+    file = tmp_path / "sized.py"
+    file.write_text(OPTIONS)
+    make(f"{file}:Sized", size=4)
+    with pytest.raises(RegistryError, match="unexpected keyword argument 'size'; it takes"):
+        make(f"{file}:Mine", size=4)
+    own = WORLD_MODELS.find_here(f"{file}:Mine")
+    for make_wrongly in (lambda: own(4), lambda: own(size=4)):
+        with pytest.raises(TypeError, match=r"Mine\(\) takes no arguments"):
+            make_wrongly()
