@@ -79,10 +79,10 @@ class Agent(BaseAgent):
             ArgumentError: a dict whose images have boxes drawn on them, which world models must not see, or a
                 manipulator's, which lacks what policies need.
         """
+        environments = LiveEnvironments()
         if simulator is not None:
-            environments = LiveEnvironments()
             environments.add(key, ForkedEnvironment(simulator))
-            self.grant(environments)
+        self.grant(environments)  # also without one: a fork of an earlier decision shows another place
         return self.decide_batch([Query(read_observation(observation), goal, key)])[0]
 
     @property

@@ -140,6 +140,15 @@ def test_the_oracle_imagines_what_then_happens(task: ImageNav) -> None:
             assert (np.abs(rollout.frames[k].astype(int) - real) > 2).mean() < 5e-3, (proposal, k)
 
 
+def test_the_oracle_needs_a_fork_for_each_decision(task: ImageNav) -> None:
+    env, agent = task.environment(depth=True), wiw.Agent("matcher", "oracle")
+    observation, key = env.begin(task.episode(0)), wiw.types.Key(0, 0)
+    agent.decide(observation, env.goal, key, simulator=env.fork())
+    moved = env.run([FORWARD, FORWARD]).observation
+    with pytest.raises(ArgumentError, match=r"pass the environment's fork"):
+        agent.decide(moved, env.goal, key.at(1))
+
+
 class Chunked(Stamp):
     """Answers two primitives a call, each frame brighter than the one before."""
 
