@@ -7,7 +7,6 @@ import shutil
 import textwrap
 import time
 from dataclasses import dataclass, field
-from datetime import datetime
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -96,8 +95,10 @@ def demo(*, out: Annotated[Path | None, arg(metavar="DIR")] = None) -> int:
     Args:
         out: Folder for the runs, one per task. Default: runs/demo-TIME.
     """
+    from wiw.runs.config import name_folder
+
     begin = time.perf_counter()
-    folder = out or Path("runs") / f"demo-{datetime.now():%Y%m%d-%H%M%S}"
+    folder = out or name_folder("demo")
     parts = [part for part in PARTS if _can_run(part)]
     codes = [_run(part, folder / part.task) for part in parts]
     print(f"\ntook    {time.perf_counter() - begin:.0f} s\n")

@@ -6,7 +6,6 @@ from __future__ import annotations
 import sys
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
-from datetime import datetime
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Literal
 
@@ -17,7 +16,7 @@ from wiw.cli.stop import stoppable
 from wiw.cli.terminal import printable
 from wiw.errors import read_last_line
 from wiw.loop.config import AgentConfig
-from wiw.runs.config import ResumeConfig, RunConfig
+from wiw.runs.config import ResumeConfig, RunConfig, name_folder
 from wiw.runs.shards import Shard
 
 if TYPE_CHECKING:
@@ -136,14 +135,14 @@ def prepare_run(
     from wiw.runs.arm_text import parse_arm
     from wiw.runs.recipes import arm_recipes
 
-    seed = config.seed or 0
     names = _split_arms(arms, parts.world_model)
     policies = [parse_arm(name).model.partition("+")[0] for name in names or []]
-    recipe, agent = rules.make_recipe(task, seed), parts.make_recipe(task, rules.preset, search, policies)
-    folder = Path(config.out or Path("runs") / f"{task.rpartition(':')[2]}-{datetime.now():%Y%m%d-%H%M%S}")
+    recipe, agent = rules.make_recipe(task, config.seed), parts.make_recipe(task, rules.preset, search, policies)
+    folder = Path(config.out or name_folder(task.rpartition(":")[2]))
     if config.out is None and config.shard is not None:
         folder = folder / Shard.parse(config.shard).folder
-    settings, built, recipes = replace(config, seed=seed, out=folder), recipe.build(), arm_recipes(agent, names)
+    built, recipes = recipe.build(), arm_recipes(agent, names)
+    settings = replace(config, seed=built.seed if config.seed is None else config.seed, out=folder)
     announce(built, recipes, settings)
     return PreparedRun(recipe, agent, names, settings, built, recipes)
 
@@ -187,6 +186,7 @@ def resume(
 
 def finish(log: Any, report: bool, remark: str = "") -> int:
     """Print tables and errors, and write the report with a remark; return 1 if the run is invalid."""
+    from wiw.report.page import write_report
     from wiw.report.tables import print_fidelity
 
     numbers = log.summary()
@@ -203,7 +203,7 @@ def finish(log: Any, report: bool, remark: str = "") -> int:
     if log.store.shard is not None:
         print(f"shard   {log.store.shard}; merge all shards with `wiw merge`")
     elif report:
-        print(f"report  {log.report(remark=remark)}")
+        print(f"report  {write_report(log, log.path / 'report.html', remark=remark, summary=numbers)}")
     print(f"run     {log.path}")
     return 1 if numbers.invalid else 0
 

@@ -4,7 +4,6 @@
 from __future__ import annotations
 
 from dataclasses import replace
-from datetime import datetime
 from pathlib import Path
 from typing import Annotated
 
@@ -14,7 +13,7 @@ from wiw.cli.numbers import parse_numbers
 from wiw.cli.parts import AgentFlags, TaskFlags
 from wiw.cli.stop import stoppable
 from wiw.loop.config import PlanConfig
-from wiw.runs.config import RunConfig
+from wiw.runs.config import RunConfig, name_folder
 
 Values = Annotated[str | None, arg(metavar="A,B,...")]
 AGENT, TASK, SEARCH, SETTINGS = AgentFlags(world_model="warp"), TaskFlags(), PlanConfig(), RunConfig(keep_images=0)
@@ -52,10 +51,9 @@ def scale(
     """
     from wiw.studies.scale import scale as run_scale
 
-    seed = config.seed or 0
-    recipe, agent = rules.make_recipe(task, seed), parts.make_recipe(task, rules.preset, search)
-    folder = Path(config.out or Path("runs") / f"scale-{datetime.now():%Y%m%d-%H%M%S}")
-    settings, kept = replace(config, seed=seed, out=folder), config.keep_images
+    recipe, agent = rules.make_recipe(task, config.seed), parts.make_recipe(task, rules.preset, search)
+    folder = Path(config.out or name_folder("scale"))
+    settings, kept = replace(config, out=folder), config.keep_images
     counts, shares = (
         parse_numbers(candidates, int, "candidates"),
         parse_numbers(imagine_fraction, float, "imagine-fraction"),

@@ -35,7 +35,13 @@ SCALES = (1.0, 0.85, 0.7, 0.6)
 
 
 def write_report(
-    run: Run, path: Path, *, episodes: int | None = None, max_mb: float | None = None, remark: str = ""
+    run: Run,
+    path: Path,
+    *,
+    episodes: int | None = None,
+    max_mb: float | None = None,
+    remark: str = "",
+    summary: Summary | None = None,
 ) -> Path:
     """Write a run's report and return its path.
 
@@ -46,6 +52,7 @@ def write_report(
         max_mb: most megabytes (10^6 bytes) of the file; pictures are made smaller, then episodes left out, until it
             fits.
         remark: sentence that the page shows below the result.
+        summary: the run's numbers, where they are known already.
 
     Raises:
         ArgumentError: a number out of range, or less than the tables and plots take.
@@ -55,19 +62,23 @@ def write_report(
         raise ArgumentError(f"report: expected episodes of at least 0, got {episodes}")
     if max_mb is not None and not max_mb > 0:
         raise ArgumentError(f"report: expected max_mb above 0, got {max_mb}")
-    page = render(run, episodes, remark=remark) if max_mb is None else _render_within(run, episodes, max_mb, remark)
+    findings = _gather_findings(run, summary)
+    if max_mb is None:
+        page = _render_page(run, findings, episodes, 1.0, remark)
+    else:
+        page = _render_within(run, findings, episodes, max_mb, remark)
     with atomic_file(path) as draft:
         draft.write_text(page, encoding="utf-8")
     return path
 
 
-def _render_within(run: Run, episodes: int | None, max_mb: float, remark: str) -> str:
+def _render_within(run: Run, findings: Mapping[str, Any], episodes: int | None, max_mb: float, remark: str) -> str:
     """Return the report with as many episodes, and then as large pictures, as `max_mb` megabytes hold."""
 
     def fits(page: str) -> bool:
         return len(page.encode()) <= max_mb * 10**6
 
-    findings, pictured = _gather_findings(run), len(choose_pictured_episodes(run.store))
+    pictured = len(choose_pictured_episodes(run.store))
     most = pictured if episodes is None else min(episodes, pictured)
     count = bisect_left(
         range(1, most + 1), True, key=lambda each: not fits(_render_page(run, findings, each, SCALES[-1], remark))
@@ -103,9 +114,9 @@ def _render_page(run: Run, findings: Mapping[str, Any], episodes: int | None, sc
     return environment().get_template("page.html.j2").render(**findings, **values)
 
 
-def _gather_findings(run: Run) -> dict[str, Any]:
+def _gather_findings(run: Run, summary: Summary | None = None) -> dict[str, Any]:
     """Return what the page shows whichever episodes have pictures: tables, plots and configuration."""
-    summary, config, info = summarise_run(run), run.store.config, run.store.info
+    summary, config, info = summary or summarise_run(run), run.store.config, run.store.info
     truths, ledger, blamed = fidelity(run), costs(run), read_blame(run.store)
     measured, paid = choose_columns(truths), cost_columns(ledger)
     words = read_wording(run.store)

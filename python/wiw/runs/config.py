@@ -3,8 +3,10 @@
 
 from __future__ import annotations
 
+import secrets
 from collections.abc import Mapping
 from dataclasses import dataclass, fields, replace
+from datetime import datetime
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
@@ -16,6 +18,11 @@ from wiw.runs.limits import Limits
 from wiw.runs.shards import Shard
 from wiw.typed_values import require_types
 from wiw.types import check_seed
+
+
+def name_folder(kind: str) -> Path:
+    """Return a new run's folder: what is run, the time, and four digits, for runs may begin in the same second."""
+    return Path("runs") / f"{kind}-{datetime.now():%Y%m%d-%H%M%S}-{secrets.token_hex(2)}"
 
 
 @dataclass(frozen=True, kw_only=True)

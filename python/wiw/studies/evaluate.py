@@ -8,7 +8,6 @@ import time
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import asdict, fields, replace
-from datetime import datetime
 from pathlib import Path
 from typing import Any
 
@@ -16,7 +15,7 @@ from wiw.analysis.stopping import StopRule, parse_stop_rule
 from wiw.errors import ArgumentError, Error, StoreError
 from wiw.loop import keys
 from wiw.metrics import Lpips
-from wiw.runs.config import EngineConfig, ResumeConfig, RunConfig, read_resume_settings, take_settings
+from wiw.runs.config import EngineConfig, ResumeConfig, RunConfig, name_folder, read_resume_settings, take_settings
 from wiw.runs.departures import describe_departures
 from wiw.runs.execute import read_recipes, require_left, run_pending, sources_of, update_own_sources
 from wiw.runs.limits import Limits
@@ -125,7 +124,8 @@ def _hint_at_settings(options: Iterable[str]) -> Iterator[None]:
         hints = [did_you_mean(name, names) for name in options if name in str(error).partition(";")[0]]
         if not any(hints):
             raise
-        raise ArgumentError(f"{error} Among the settings of the run:{next(filter(None, hints))}") from None
+        end = "" if str(error).endswith((".", "?")) else "."
+        raise ArgumentError(f"{error}{end}{next(filter(None, hints))} That is a setting of the run.") from None
 
 
 def resume_run(
@@ -214,7 +214,7 @@ def _run(task: Any, agents: Mapping[str, Any], settings: RunConfig, more_arms: b
         started, salt = time.perf_counter(), _choose_salt(settings)
         episodes, pictured = built.episodes(count), settings.count_pictured(count)
         used = built.require(episodes)
-        folder = settings.out or Path("runs") / f"{built.name}-{datetime.now():%Y%m%d-%H%M%S}"
+        folder = settings.out or name_folder(built.name)
         info = {
             "platform": describe_platform(),
             "task": task.to_json(),

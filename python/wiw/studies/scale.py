@@ -11,7 +11,6 @@ from __future__ import annotations
 import json
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass, replace
-from datetime import datetime
 from pathlib import Path
 from typing import Any
 
@@ -21,7 +20,7 @@ from wiw.analysis.summary import show_estimate
 from wiw.errors import ArgumentError
 from wiw.files import write_files
 from wiw.report.tables import print_stacked
-from wiw.runs.config import RunConfig, take_settings
+from wiw.runs.config import RunConfig, name_folder, take_settings
 from wiw.runs.recipes import AgentRecipe, agent_recipe
 from wiw.runs.rows import to_json
 from wiw.studies.evaluate import run_arms
@@ -144,7 +143,7 @@ def scale(
             "scale: a curve needs all episodes, so --shard is not supported; use `wiw run --shard` for each number of "
             "candidates instead"
         )
-    out = own.out or Path("runs") / f"scale-{datetime.now():%Y%m%d-%H%M%S}"
+    out = own.out or name_folder("scale")
     keeps_images = "keep_images" in settings or own.keep_images != RunConfig.keep_images
     kept = own.keep_images if keeps_images else 0
     run_config = replace(own, out=out, keep_images=kept, episodes=own.episodes or EPISODES)

@@ -518,3 +518,10 @@ def test_agents_of_wrapped_parts_are_evaluated_as_they_are(two_rooms: str, tmp_p
     assert (said["placebo"], said["imagine_fraction"]) == ("shuffled", 0.5)
     imagined = [row for row in log.decisions if row["fidelity"] is not None]
     assert 0 < len(imagined) < len(log.decisions) == 4
+
+
+def test_runs_that_begin_in_the_same_second_have_folders_of_their_own(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    for _ in range(2):
+        run(None, episodes=1).close()
+    assert len({log.parent for log in Path("runs").glob("*/run.sqlite")}) == 2
