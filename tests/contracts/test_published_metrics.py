@@ -3,6 +3,7 @@
 
 from __future__ import annotations
 
+import math
 import sys
 from collections.abc import Iterator
 from pathlib import Path
@@ -83,6 +84,14 @@ def test_values_that_are_none_of_its_kind_are_refused(value: float, message: str
     with pytest.raises(ContractError, match=f"metric 'odd': expected {message}"):
         metric.add_to({"success": 1.0})
     assert metric.add_to({}) == {} and metric.add_to({"odd": 7.0}) == {"odd": 7.0}
+
+
+def test_what_follows_from_nothing_measured_is_not_measured_either() -> None:
+    metric = wiw.Metric("half", "Half", "rate", True, of=lambda metrics: metrics["success"] / 2)
+    assert math.isnan(metric.add_to({"success": math.nan, "actions": 3.0})["half"])
+    odd = wiw.Metric("odd", "Odd", "length", True, of=lambda metrics: metrics["actions"] * math.inf)
+    with pytest.raises(ContractError, match="metric 'odd': expected a finite number, got inf"):
+        odd.add_to({"success": math.nan, "actions": 3.0})
 
 
 def test_what_it_raises_is_named() -> None:

@@ -97,6 +97,7 @@ class Breakdown:
                 "arm": arm,
                 **({"base": self.base} if self.base else {}),
                 self.key_name: key,
+                **({"unit": self.cut_unit} if self.cut_unit else {}),
                 "metric": self.metric.name,
                 "value": one.value,
                 "low": one.low,

@@ -140,7 +140,7 @@ class Curve:
     """Both of primary measures over numbers of clips alone."""
     gain_p: float | None = None
     """Of primary measures over numbers of scenes alone: two-sided p of no gain, by flipping the signs of whole seeds,
-    Holm-adjusted for all models and primary measures."""
+    Holm-adjusted for all models and primary measures; None where a seed has measured nothing."""
 
     @property
     def is_gain_shown(self) -> bool:
@@ -362,11 +362,15 @@ def _draw_curve(arm: ScalingArm, measure: str, means: Resampled, primary: bool) 
 
 
 def _test_scene_gains(curves: Sequence[Curve], primary: Mapping[str, str]) -> tuple[Curve, ...]:
-    """Return the curves with the p of what all scenes gain over the fewest, where it is primary."""
-    tested = [curve for curve in curves if curve.arm.name == FEWER_SCENES and curve.measure in primary]
-    raw = [flip_signs(np.array(curve.by_seed[0]) - np.array(curve.by_seed[-1])) for curve in tested]
-    adjusted = {id(curve): float(p) for curve, p in zip(tested, holm(raw), strict=True)}
-    return tuple(replace(curve, gain_p=adjusted[id(curve)]) if id(curve) in adjusted else curve for curve in curves)
+    """Return the curves with the p of what all scenes gain over the fewest, where it is primary and known."""
+    gains = {
+        index: np.subtract(curve.by_seed[0], curve.by_seed[-1])
+        for index, curve in enumerate(curves)
+        if curve.arm.name == FEWER_SCENES and curve.measure in primary
+    }
+    known = {index: own for index, own in gains.items() if np.isfinite(own).all()}
+    adjusted = dict(zip(known, holm([flip_signs(own) for own in known.values()]).tolist(), strict=True))
+    return tuple(replace(curve, gain_p=adjusted.get(index)) for index, curve in enumerate(curves))
 
 
 def _split_arm(means: Resampled, short: ScalingArm, arms: Sequence[ScalingArm]) -> Split:

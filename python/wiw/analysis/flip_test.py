@@ -16,6 +16,7 @@ from numpy.typing import ArrayLike
 from scipy import special
 
 from wiw.analysis.intervals import Array, Interval, Kind, draw_in_blocks, p_value_of_sums, sum_by_cluster
+from wiw.errors import ArgumentError
 
 FEWEST_SCENES = 8
 """Scenes from which on they are flipped: with fewer, too few flips are possible for a small p."""
@@ -61,7 +62,12 @@ def flip_signs(sums: Array, seed: int = 0) -> float:
     Args:
         sums: float [scenes]; zeros do not matter.
         seed: of the flips, where not all are tried.
+
+    Raises:
+        ArgumentError: sums that are not finite, of which no flip can be counted.
     """
+    if not np.isfinite(sums).all():
+        raise ArgumentError(f"flip_signs: expected finite sums, got {sums}; leave out what was not measured")
     sizes = np.abs(sums[np.abs(sums) > 1e-12])
     seen = abs(float(sums.sum())) - 1e-9 * float(sizes.sum())
     if len(sizes) == 0:

@@ -4,13 +4,14 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Iterator
 from dataclasses import dataclass
 from itertools import permutations
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from wiw.analysis.intervals import Interval
+from wiw.analysis.intervals import BLOCK, Interval
 from wiw.errors import ArgumentError
 
 LEAST = 3
@@ -130,8 +131,10 @@ _Sums = tuple[NDArray[np.float64], NDArray[np.float64]]
 
 
 def _sum_clusters(values: NDArray[np.float64], clusters: NDArray[np.int64]) -> _Sums:
-    members = np.eye(clusters.max(initial=-1) + 1)[clusters]
-    return np.nan_to_num(values) @ members, (~np.isnan(values)).astype(np.float64) @ members
+    sums, counts = np.zeros((2, clusters.max(initial=-1) + 1, len(values)))
+    np.add.at(sums, clusters, np.nan_to_num(values).T)
+    np.add.at(counts, clusters, ~np.isnan(values).T)
+    return sums.T, counts.T
 
 
 def _weigh(sums: _Sums, weights: NDArray[np.float64]) -> NDArray[np.float64]:
@@ -145,14 +148,21 @@ def _bootstrap(means: tuple[_Sums, _Sums], skip: bool, seed: int) -> tuple[float
     clusters = means[0][0].shape[1]
     if skip or clusters < FEW:
         return math.nan, math.nan, 0.0
-    rng = np.random.Generator(np.random.Philox(key=seed))
-    weights = rng.multinomial(clusters, np.full(clusters, 1 / clusters), RESAMPLES).astype(np.float64)
-    drawn = spearman(*(_weigh(own, weights) for own in means))
+    blocks = _draw_weights(clusters, seed)
+    drawn = np.concatenate([spearman(*(_weigh(own, weights) for own in means)) for weights in blocks])
     known = drawn[~np.isnan(drawn)]
     if len(known) < RESAMPLES / 2:
         return math.nan, math.nan, len(known) / RESAMPLES
     low, high = _find_interval(known)
     return low, high, len(known) / RESAMPLES
+
+
+def _draw_weights(clusters: int, seed: int) -> Iterator[NDArray[np.float64]]:
+    """Yield how often each draw has each cluster, float64 [RESAMPLES, clusters] in all, a block of draws at a time."""
+    rng, most = np.random.Generator(np.random.Philox(key=seed)), max(1, BLOCK // clusters)
+    for begin in range(0, RESAMPLES, most):
+        count = min(most, RESAMPLES - begin)
+        yield rng.multinomial(clusters, np.full(clusters, 1 / clusters), count).astype(np.float64)
 
 
 def _find_interval(values: NDArray[np.float64]) -> Interval:

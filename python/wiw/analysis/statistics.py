@@ -6,7 +6,8 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
-from typing import Any
+from functools import partial
+from typing import Any, overload
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -31,6 +32,28 @@ LEVEL = 0.05
 """Adjusted p up to which a difference counts as shown."""
 
 
+class _Bootstrap:
+    """The field `Estimate.bootstrap`, set to an interval or to a function that computes it when it is first read.
+
+    It takes far longer than all else of an estimate, and few of its readers show it.
+    """
+
+    @overload
+    def __get__(self, estimate: None, owner: type) -> None: ...
+    @overload
+    def __get__(self, estimate: Estimate, owner: type) -> Interval | None: ...
+    def __get__(self, estimate: Estimate | None, owner: type) -> Interval | None:
+        if estimate is None:
+            return None  # the field's default
+        found = estimate.__dict__["bootstrap"]
+        if callable(found):
+            found = estimate.__dict__["bootstrap"] = found()
+        return found
+
+    def __set__(self, estimate: Estimate, value: Interval | Callable[[], Interval] | None) -> None:
+        estimate.__dict__["bootstrap"] = value
+
+
 @dataclass(frozen=True)
 class Estimate:
     """A mean and its confidence interval, in the units shown (rates and their differences in percent)."""
@@ -44,7 +67,7 @@ class Estimate:
     """Episodes."""
     scenes: int
     method: str
-    bootstrap: Interval | None = None
+    bootstrap: _Bootstrap = _Bootstrap()
     """A second opinion: the bootstrap over scenes, too narrow where they are few; None for one scene."""
     effective_scenes: float = 1.0
     """Scenes with equally many episodes each that would say as much."""
@@ -81,10 +104,9 @@ class Difference:
 
 def estimate_mean(values: ArrayLike, scenes: Sequence[str], metric: Metric, *, seed: int = 0) -> Estimate:
     """Return the mean over episodes with a 95 % interval over scenes (`intervals`); `seed` is the bootstrap's."""
-    data = np.asarray(values, np.float64)
+    data = np.array(values, np.float64)
     kind: Kind = "rate" if metric.kind == "rate" else "length"
-    found = _estimate(data, scenes, metric, kind, _find_reach(data, metric), seed)
-    return replace(found, low=max(found.low, metric.scale * metric.least))
+    return _estimate(data, scenes, metric, kind, _find_reach(data, metric), seed, metric.least)
 
 
 def estimate_difference(
@@ -204,7 +226,13 @@ _OVER_EPISODES: dict[Kind, Callable[[NDArray[np.float64], Interval], Interval]] 
 
 
 def _estimate(
-    data: NDArray[np.float64], scenes: Sequence[str], metric: Metric, kind: Kind, reach: Interval, seed: int
+    data: NDArray[np.float64],
+    scenes: Sequence[str],
+    metric: Metric,
+    kind: Kind,
+    reach: Interval,
+    seed: int,
+    least: float = -math.inf,
 ) -> Estimate:
     groups, scale = len(set(scenes)), metric.scale
     second, name = None, _OVER_SCENES[kind]
@@ -213,9 +241,14 @@ def _estimate(
     elif groups > 1:
         name = f"{name} over {groups} scenes"
         low, high = clustered_interval(data, list(scenes), kind, reach=reach)
-        bootstrap = clustered_bootstrap(data, list(scenes), seed=seed)
-        second = scale * bootstrap[0], scale * bootstrap[1]
+        second = partial(_resample, data, list(scenes), scale, seed)
     else:
         low, high = _OVER_EPISODES[kind](data, reach)
     effective = count_effective(sum_by_cluster(data, np.asarray(scenes))[1])
-    return Estimate(scale * float(data.mean()), scale * low, scale * high, len(data), groups, name, second, effective)
+    low = max(scale * low, scale * least)
+    return Estimate(scale * float(data.mean()), low, scale * high, len(data), groups, name, second, effective)
+
+
+def _resample(data: NDArray[np.float64], scenes: list[str], scale: float, seed: int) -> Interval:
+    low, high = clustered_bootstrap(data, scenes, seed=seed)
+    return scale * low, scale * high

@@ -30,7 +30,7 @@ from wiw.analysis.statistics import LEVEL, Difference, Estimate, Units, adjust_p
 from wiw.analysis.stopping import describe_bets, find_units
 from wiw.analysis.utility import CEILING, FLOOR, Utility, utility
 from wiw.errors import RegistryError, read_last_line
-from wiw.metrics.metric import ANSWER_SCORE, SPL, SPL_RULE, SUCCESS, Metric
+from wiw.metrics.metric import ANSWER_SCORE, SPL, SPL_RULE, Metric, name_column
 from wiw.registry import METRICS
 from wiw.runs.departures import Departure, read_departures
 from wiw.runs.judges import JudgeRecord
@@ -64,8 +64,9 @@ GAINS = {
 BLIND_ROLE = "floor, best guess from the question's text alone"
 WORLD_MODEL, ANOTHER_POLICY = "world model", "another policy without a world model"
 
-SPAN = (CEILING, FLOOR, SUCCESS.name)
-"""Arm, base and metric of the difference that utility is a share of."""
+UTILITY_COLUMNS = ("utility", "utility_low", "utility_high")
+OWN_COLUMNS = frozenset({"arm", "tier", "role", "n", "asked", "errors", *UTILITY_COLUMNS, "judge", "approximate_marks"})
+"""Columns of the exported table of arms that are no metrics."""
 
 MAX_ERROR_SHARE = 0.01
 """Largest share of an arm's ended episodes that may have ended with an infrastructure error in a valid run."""
@@ -428,30 +429,30 @@ def count_unbalanced(run: Run) -> int:
 
 
 def arm_table(run: Run) -> Records:
-    """Return the table of arms as plain values: one dict per arm, with `<metric>`, `<metric>_low`, `<metric>_high`.
+    """Return the table of arms as plain values, a dict per arm; see `list_arm_lines`."""
+    return Records(list_arm_lines(summarise_run(run)))
+
+
+def list_tier_lines(summary: Summary) -> list[dict[str, Any]]:
+    """Return the lines of each tier of episodes, with its name as "tier"; none unless there are several."""
+    return [{"tier": tier, **line} for tier, own in summary.tiers.items() for line in list_arm_lines(own)]
+
+
+def list_arm_lines(summary: Summary) -> list[dict[str, Any]]:
+    """Return the lines of a summary as plain values, with `<metric>`, `<metric>_low` and `<metric>_high`.
 
     "utility" and its ends are there for arms between floor and ceiling, nan where undefined.
     """
-    return Records(_list_lines(summarise_run(run)))
-
-
-def tier_table(run: Run) -> Records:
-    """Return the same for each tier of episodes separately, with its name as "tier"; empty unless there are several."""
-    tiers = summarise_run(run).tiers
-    return Records({"tier": tier, **line} for tier, own in tiers.items() for line in _list_lines(own))
-
-
-def _list_lines(summary: Summary) -> list[dict[str, Any]]:
-    """Return the lines of a summary as plain values."""
     utilities = {found.arm: found for found in summary.utilities}
     lines = []
     for arm in summary.lines:
         line: dict[str, Any] = {"arm": arm.name, "role": arm.role}
         line |= {"n": arm.done, "asked": arm.total, "errors": arm.errors}
         for metric, estimate in arm.estimates.items():
-            line |= {metric: estimate.value, f"{metric}_low": estimate.low, f"{metric}_high": estimate.high}
+            name = name_column(metric, OWN_COLUMNS)
+            line |= {name: estimate.value, f"{name}_low": estimate.low, f"{name}_high": estimate.high}
         if found := utilities.get(arm.name):
-            line |= {"utility": found.value, "utility_low": found.low, "utility_high": found.high}
+            line |= dict(zip(UTILITY_COLUMNS, (found.value, found.low, found.high), strict=True))
         if summary.marks is not None:
             line |= {
                 "judge": summary.marks.judge.full_label,
@@ -736,17 +737,19 @@ def _explain_utility(summary: Summary) -> list[str]:
         return []
     found = ["U = (SR - copy) / (oracle - copy), on the episodes scored in all three; Fieller's interval."]
     if any(not one.is_defined for one in summary.utilities):
-        span = [each for each in summary.differences if (each.arm, each.base, each.metric) == SPAN]
-        found.append(f"Utility undefined: {_explain_span(span)}.")
+        found.append(f"Utility undefined: {_explain_undefined(summary.utilities)}.")
     return found
 
 
-def _explain_span(span: Sequence[Difference]) -> str:
-    if any(each.estimate.high < 0 for each in span):
-        return "the interval for oracle - copy lies below 0"
-    if any(each.estimate.low > 0 for each in span):
-        return "too little data for an interval of this ratio"
-    return "the interval for oracle - copy includes 0"
+def _explain_undefined(utilities: Sequence[Utility]) -> str:
+    """Return why utilities are undefined, with the names of arms where not all have the same reason."""
+    arms: dict[str, list[str]] = {}
+    for one in utilities:
+        if not one.is_defined:
+            arms.setdefault(one.reason, []).append(one.arm)
+    if len(arms) == 1:
+        return next(iter(arms))
+    return "; ".join(f"{reason} ({', '.join(names)})" for reason, names in arms.items())
 
 
 def _explain_partial(summary: Summary) -> list[str]:

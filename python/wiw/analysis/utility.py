@@ -22,6 +22,8 @@ from wiw.analysis.intervals import (
     stabilise_mean,
     sum_by_cluster,
 )
+from wiw.analysis.statistics import estimate_difference
+from wiw.metrics.metric import SUCCESS
 
 FLOOR, CEILING = "copy", "oracle"
 UNKNOWN: tuple[float, Interval] = (math.nan, (math.nan, math.nan))
@@ -41,6 +43,8 @@ class Utility:
     scenes: int
     reference: bool
     """Whether the arm is a reference rather than a world model under test."""
+    reason: str = ""
+    """Why it is undefined; empty where it is defined."""
 
     @property
     def is_defined(self) -> bool:
@@ -66,7 +70,18 @@ def utility(arm: str, done: Mapping[str, Mapping[int, Mapping[str, Any]]], refer
     scenes = [done[arm][i]["scene"] for i in common]
     clusters: Sequence[Any] = scenes if len(set(scenes)) > 1 else common  # one scene: over its episodes
     value, (low, high) = ratio(scored - floor, ceiling - floor, clusters)
-    return Utility(arm, value, low, high, len(common), len(set(scenes)), reference)
+    reason = _explain_undefined(ceiling, floor, scenes) if math.isnan(value) else ""
+    return Utility(arm, value, low, high, len(common), len(set(scenes)), reference, reason)
+
+
+def _explain_undefined(ceiling: Array, floor: Array, scenes: Sequence[str]) -> str:
+    """Return why utility is undefined, by the interval that tables show for ceiling - floor."""
+    span = estimate_difference(ceiling, floor, scenes, SUCCESS)
+    if span.high < 0:
+        return f"the interval for {CEILING} - {FLOOR} lies below 0"
+    if span.low > 0:
+        return "too little data for an interval of this ratio"
+    return f"the interval for {CEILING} - {FLOOR} includes 0"
 
 
 def ratio(gains: ArrayLike, spans: ArrayLike, clusters: ArrayLike, confidence: float = 0.95) -> tuple[float, Interval]:

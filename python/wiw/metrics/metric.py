@@ -4,7 +4,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Collection, Mapping
 from dataclasses import dataclass
 from typing import Literal
 
@@ -57,7 +57,8 @@ class Metric:
         """Return an episode's metrics with this one's value, if it can be computed from them.
 
         Raises:
-            ContractError: `of` raised, or its value is not finite, or a rate is outside [0, 1].
+            ContractError: `of` raised, or its value is not finite, or a rate is outside [0, 1]. NaN is a value where a
+                metric that `of` was given is NaN: it was not measured, and neither is what follows from it.
         """
         if self.of is None or self.name in metrics:
             return metrics
@@ -68,6 +69,8 @@ class Metric:
         except Exception as error:
             message = f"{type(error).__name__}: {error}"
             raise ContractError(f"metric '{self.name}': {message}; it was given {dict(metrics)}") from error
+        if math.isnan(value) and any(map(math.isnan, metrics.values())):
+            return {**metrics, self.name: value}
         if not math.isfinite(value) or (self.kind == "rate" and not 0 <= value <= 1):
             expected = "a number from 0 to 1" if self.kind == "rate" else "a finite number"
             raise ContractError(f"metric '{self.name}': expected {expected}, got {value} of {dict(metrics)}")
@@ -77,6 +80,11 @@ class Metric:
 def is_success(metrics: Mapping[str, float]) -> bool:
     """Return whether an episode counts as a success; a part of one, which a task of one's own may give, does not."""
     return metrics.get("success", 0) >= 1
+
+
+def name_column(metric: str, taken: Collection[str]) -> str:
+    """Return a metric's column in an exported table: "metric_NAME" where one of the table's own has its name."""
+    return f"metric_{metric}" if metric in taken else metric
 
 
 SUCCESS = Metric("success", "SR", "rate", True, about="Success rate: percent of episodes that succeeded.")

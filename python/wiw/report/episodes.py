@@ -46,15 +46,22 @@ def make_title(run: Run) -> str:
 
 
 def outcomes_by_episode(store: RunStore, arms: Sequence[str]) -> dict[int, dict[str, Mapping[str, Any]]]:
-    """Return outcomes by episode, then by arm in the order of `arms`, without episodes that no arm has ended."""
+    """Return outcomes by episode, then by arm in the order of `arms`, without episodes that no arm has ended.
+
+    Metrics that were not measured (None in the store) are left out.
+    """
     found_blame = read_blame(store)
     verdicts = found_blame.verdicts() if found_blame is not None else {}
-    by_arm = {(row["arm"], row["episode"]): row for row in store.outcomes()}
+    by_arm = {(row["arm"], row["episode"]): _drop_unmeasured(row) for row in store.outcomes()}
     by_arm |= {key: {**by_arm[key], "blame": verdict} for key, verdict in verdicts.items()}
     found: dict[int, dict[str, Mapping[str, Any]]] = {}
     for index in sorted({episode for _, episode in by_arm}):
         found[index] = {arm: by_arm[arm, index] for arm in arms if (arm, index) in by_arm}
     return found
+
+
+def _drop_unmeasured(row: Mapping[str, Any]) -> dict[str, Any]:
+    return {**row, "metrics": {name: value for name, value in row["metrics"].items() if value is not None}}
 
 
 def read_story(

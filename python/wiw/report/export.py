@@ -11,9 +11,10 @@ from collections.abc import Callable, Iterator, Mapping
 from pathlib import Path
 from typing import Any
 
-from wiw.analysis.summary import arm_table, summarise_run, tier_table
+from wiw.analysis.summary import list_arm_lines, list_tier_lines, summarise_run
 from wiw.errors import ArgumentError
 from wiw.files import atomic_file, atomic_folder
+from wiw.metrics.metric import name_column
 from wiw.runs.rows import to_json
 from wiw.runs.run import Run
 
@@ -53,16 +54,16 @@ def tables(run: Run) -> dict[str, Table]:
     Ended episodes only; a metric is a column of outcomes, seconds and counts are columns of decisions. Where the task
     has them: tiers, kinds, anytime, anytime_differences, twins, and judgements, by all judges.
     """
-    decisions = run.store.decisions()
+    decisions, summary = run.store.decisions(), summarise_run(run)
     further: dict[str, Table] = {}
-    for breakdown in summarise_run(run).breakdowns:
+    for breakdown in summary.breakdowns:
         further.setdefault(breakdown.name, []).extend(breakdown.list_cells())
-    if tiers := tier_table(run):
-        further["tiers"] = [dict(line) for line in tiers]
+    if tiers := list_tier_lines(summary):
+        further["tiers"] = tiers
     if judgements := list_judgements(run):
         further["judgements"] = judgements
     return {
-        "arms": [dict(line) for line in arm_table(run)],
+        "arms": list_arm_lines(summary),
         "episodes": _tabulate_episodes(run),
         "outcomes": [
             _drop_nested({**row, **_name_metrics(row), "details": to_json(row["details"])}, "metrics")
@@ -75,8 +76,8 @@ def tables(run: Run) -> dict[str, Table]:
 
 
 def _name_metrics(outcome: Mapping[str, Any]) -> dict[str, float]:
-    """Return an outcome's metrics by the names of their columns: "metric_NAME" where another column has that name."""
-    return {f"metric_{name}" if name in outcome else name: value for name, value in outcome["metrics"].items()}
+    """Return an outcome's metrics by the names of their columns."""
+    return {name_column(name, outcome): value for name, value in outcome["metrics"].items()}
 
 
 def list_judgements(run: Run) -> Table:

@@ -1,7 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
 import io
 import math
-from dataclasses import replace
+import pickle
+from dataclasses import asdict, replace
 from typing import Any
 
 import numpy as np
@@ -12,7 +13,7 @@ from rich.console import Console
 from scipy import stats
 
 import wiw
-from wiw.analysis import flip_test, intervals
+from wiw.analysis import flip_test, intervals, statistics
 from wiw.analysis.flip_test import DRAWS, approximate_flips, find_p_value, flip_signs
 from wiw.analysis.intervals import (
     clustered_bootstrap,
@@ -30,6 +31,7 @@ from wiw.analysis.intervals import (
 from wiw.analysis.statistics import compare, compute_p_value, estimate_difference, estimate_mean, holm
 from wiw.analysis.summary import load_metrics, notes, show_estimate, summarise
 from wiw.errors import ArgumentError
+from wiw.registry import METRICS
 from wiw.report.page import sentence, summary_html
 from wiw.report.tables import SummaryTable
 
@@ -86,6 +88,8 @@ def test_flips_of_single_episodes_are_mcnemars_test():
     table = [[((arm == a) & (base == b)).sum() for b in (0, 1)] for a in (0, 1)]
     assert flip_signs(arm - base) == pytest.approx(tables.mcnemar(table, exact=True).pvalue)
     assert flip_signs(np.zeros(2)) == 1.0
+    with pytest.raises(ArgumentError, match="expected finite sums"):
+        flip_signs(np.array([math.nan, 1.0, 2.0]))
 
 
 @settings(max_examples=60, deadline=None)
@@ -412,6 +416,31 @@ def test_lengths_that_are_all_the_least_have_an_unknown_interval_and_not_one_of_
     assert compute_p_value([0.0] * 6, [0.0] * 6, scenes, TRAJ) == 1
     known = estimate_mean([0.0] * 5 + [1.0], scenes, TRAJ)
     assert known.low == 0 and known.high > 0.3
+
+
+def test_an_unmeasured_episode_leaves_all_other_numbers(monkeypatch):
+    half = wiw.Metric("half", "Half", "length", True, of=lambda metrics: metrics["actions"] / 2)
+    monkeypatch.setitem(METRICS.registered, "half", half)
+    rows = [outcome(arm, i, 1.0, actions=None if i == 3 else 9.0) for arm in ("none", "warp") for i in range(6)]
+    found = summarise(["none", "warp"], rows, 6)
+    assert math.isnan(found["warp"].estimates["half"].value) and found["warp"].estimates["success"].value == 100
+    assert math.isnan(found.difference("warp", "none", "half").estimate.value)
+
+
+def test_the_bootstrap_is_computed_when_it_is_read(monkeypatch):
+    rows = [outcome(arm, i, float(i % 2), actions=i) for arm in ("none", "warp") for i in range(6)]
+    calls = []
+    monkeypatch.setattr(
+        statistics, "clustered_bootstrap", lambda *a, **k: calls.append(a) or clustered_bootstrap(*a, **k)
+    )
+    found = SummaryTable.of(summarise(["none", "warp"], rows, 6))
+    assert "0.0" in shown(found) and not calls
+    data, scenes = np.arange(6.0), [f"s{i % 3}" for i in range(6)]
+    once = found["none"].estimates["actions"]
+    assert once.bootstrap == once.bootstrap == clustered_bootstrap(data, scenes) and len(calls) == 1
+    again, kept = estimate_mean(data, scenes, TRAJ), estimate_mean(data, scenes, TRAJ)
+    data[:] = 0
+    assert once == again == pickle.loads(pickle.dumps(kept)) and asdict(kept)["bootstrap"] == once.bootstrap
 
 
 def test_an_unknown_interval_is_explained():

@@ -2,6 +2,7 @@
 import io
 import math
 import re
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -103,6 +104,17 @@ def test_an_oracle_that_is_worse_than_the_floor_is_said_to_be():
     found = summary({**RATES, "copy": 0.8, "oracle": 0.1})
     assert found.difference("oracle", "copy").estimate.high < 0 and not found.utility("mine").is_defined
     assert "Utility undefined: the interval for oracle - copy lies below 0." in notes(found)
+
+
+def test_why_utility_is_undefined_is_known_without_the_difference():
+    """As in a comparison of runs, whose differences are between the runs, and whose arms may have other oracles."""
+    worse, better = (summary({**RATES, "copy": copy, "oracle": oracle}) for copy, oracle in ((0.8, 0.1), (0.2, 0.22)))
+    assert "Utility undefined: the interval for oracle - copy lies below 0." in notes(replace(worse, differences=()))
+    both = replace(
+        worse, differences=(), utilities=(worse.utility("mine"), better.utility("warp"), summary().utility("none"))
+    )
+    said = "the interval for oracle - copy lies below 0 (mine); the interval for oracle - copy includes 0 (warp)"
+    assert f"Utility undefined: {said}." in notes(both)
 
 
 def test_only_episodes_that_all_three_have_finished_count():

@@ -44,6 +44,7 @@ def test_answers_count_as_they_stood() -> None:
     curve, gain = summarise_answers(ANSWERS).breakdowns
     assert (curve.name, gain.name, gain.base) == ("anytime", "anytime_differences", "none")
     assert curve.keys == gain.keys == ("1", "2", "3") and curve.cut_unit == gain.cut_unit == "decisions"
+    assert {row["unit"] for each in (curve, gain) for row in each.list_cells()} == {"decisions"}
     none, oracle = ([0, 0, 1, 0], [1, 1, 1, 0])  # after two decisions, by hand
     assert curve.estimates["none"]["2"] == estimate_mean(none, SCENES, SUCCESS)
     assert curve.estimates["oracle"]["2"] == estimate_mean(oracle, SCENES, SUCCESS)

@@ -14,8 +14,13 @@ from pathlib import Path
 import pytest
 from fakes import LineAgent, LineTask
 
+from wiw.analysis import summary
+from wiw.analysis.summary import summarise_run
 from wiw.cli import main
 from wiw.errors import ArgumentError, FileError
+from wiw.metrics.metric import Metric
+from wiw.registry import METRICS
+from wiw.report import export
 from wiw.report.export import tables
 from wiw.runs.store_file import store_path
 from wiw.studies.evaluate import run_arms
@@ -90,6 +95,29 @@ def test_outcomes_have_their_tier_and_keep_their_columns(tmp_path):
     rows = tables(load_run(log.path))["outcomes"]
     assert [row["tier"] for row in rows] == ["near", "far"]
     assert all((row["kind"], row["metric_kind"], row["metric_seconds"]) == ("", 1, 7) for row in rows)
+
+
+def test_arms_and_tiers_keep_their_columns_too(tmp_path, monkeypatch):
+    names = ("n", "errors", "role", "tier", "utility")
+    for name in names:
+        monkeypatch.setitem(METRICS.registered, name, Metric(name, name, "length", True))
+    log = run_arms(TieredTask(), {"none": LineAgent()}, 4, out=tmp_path / "run", progress=False)
+    with sqlite3.connect(store_path(log.path)) as store:
+        for name in names:
+            store.execute(f"UPDATE outcome SET metrics = json_set(metrics, '$.{name}', 7.0)")
+    made = tables(load_run(log.path))
+    assert [row["tier"] for row in made["tiers"]] == ["near", "far"] and "utility" not in made["arms"][0]
+    for row in (*made["arms"], *made["tiers"]):
+        assert row["n"] > 1 and row["errors"] == 0 and row["role"].startswith("policy")
+        assert [row[f"metric_{name}"] for name in names] == [7] * len(names) and "metric_n_low" in row
+
+
+def test_a_run_is_summarised_once(log, monkeypatch):
+    calls = []
+    for module in (export, summary):
+        monkeypatch.setattr(module, "summarise_run", lambda run: calls.append(run) or summarise_run(run))
+    made = tables(log)
+    assert calls == [log] and made["arms"] == log.table()
 
 
 def test_every_column_is_described(log):

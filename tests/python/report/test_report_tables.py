@@ -13,12 +13,14 @@ from rich.console import Console
 
 from wiw.analysis.costs import COLUMNS, costs
 from wiw.analysis.fidelity import choose_columns, fidelity
-from wiw.analysis.summary import show_estimate, summarise
+from wiw.analysis.summary import show_estimate, summarise, summarise_run
 from wiw.cli import main
-from wiw.report import tables
+from wiw.cli.run import finish
+from wiw.report import page, tables
 from wiw.report.page import summary_html
 from wiw.report.tables import SummaryTable
 from wiw.runs.store_file import store_path
+from wiw.studies import run_log
 from wiw.studies.evaluate import run_arms
 from wiw.types import TableSpec
 
@@ -126,9 +128,17 @@ def test_a_breakdown_says_how_many_episodes_its_arms_have(width):
 def test_the_end_of_a_run_prints_fidelity(log, capsys):
     assert main(["report", str(log.path)]) == 0
     assert "Fidelity of imagination" in capsys.readouterr().out
-    from wiw.cli.run import finish
-
     assert finish(log, report=False) == 0 and "Fidelity of imagination" in capsys.readouterr().out
+
+
+def test_the_end_of_a_run_summarises_it_once(tmp_path, monkeypatch, capsys):
+    log = run_arms(LineTask(), {"none": LineAgent()}, 2, out=tmp_path / "run", progress=False)
+    calls = []
+    for module in (run_log, page):
+        monkeypatch.setattr(module, "summarise_run", lambda run: calls.append(run) or summarise_run(run))
+    assert finish(log, report=True, remark="As agreed.") == 0 and calls == [log]
+    assert f"report  {log.path / 'report.html'}" in capsys.readouterr().out
+    assert "As agreed." in (log.path / "report.html").read_text()
 
 
 @pytest.mark.parametrize("width", [60, 140])

@@ -21,6 +21,7 @@ from wiw.report.site import PictureFolder, write_view
 from wiw.runs.rows import decode_jpeg, encode_jpeg
 from wiw.runs.store_file import store_path
 from wiw.studies.evaluate import run_arms
+from wiw.studies.run_log import load_run
 from wiw.types import Episode
 
 EVIL = """<img src=x onerror="document.title='owned'">'"/../&"""
@@ -105,6 +106,20 @@ def test_names_from_the_run_stay_text(log, site):
         assert [tag for tag, _ in Page(html).tags].count("script") == 1
     assert all(re.fullmatch(r"[\w.-]+", file.name) for file in (site.index.parent / "images").iterdir())
     assert {p.name for p in site.index.parent.iterdir()} == {"index.html", "episodes", "images"}
+
+
+@pytest.mark.parametrize("categories", [(), ("chair",)])
+def test_what_was_not_measured_is_left_out(tmp_path, categories):
+    log = run_arms(LineTask(), {"none": LineAgent(0.0)}, 2, out=tmp_path / "run", progress=False, keep_images="all")
+    nothing = json.dumps({"success": 0, "decisions": 1, "distance_to_goal": None, "predicted": None})
+    with sqlite3.connect(store_path(log.path)) as store:
+        store.execute("UPDATE outcome SET metrics = ?", (nothing,))
+        config = "json_set(config, '$.task.categories', json(?))"
+        store.execute(f"UPDATE run SET config = {config}", (json.dumps(categories),))
+    log = load_run(log.path)
+    made = [write_view(log, tmp_path / "view").index.parent / "episodes" / "0000.html", log.report()]
+    said = f"{'no answer' if categories else 'not succeeded'} after {len(log.store.decisions('none', 0))} decisions"
+    assert all(re.search(rf"{said}\s*<", file.read_text()) for file in made)
 
 
 def test_a_view_is_replaced_and_nothing_else_is(log, tmp_path, capsys):

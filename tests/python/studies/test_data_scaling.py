@@ -260,6 +260,14 @@ def test_scenes_are_said_to_gain_where_the_adjusted_test_over_trainings_finds_it
     assert table.find_curve("warpnet", ONE_EPOCH, "error").gain_p is None
 
 
+def test_a_gain_that_is_unknown_in_a_seed_is_not_tested() -> None:
+    table = make_scene_table(6, {"warpnet": 3.0, "pocket": math.nan})
+    known, unknown = (table.find_curve(model, FEWER_SCENES, "error") for model in ("warpnet", "pocket"))
+    assert known.gain_p == pytest.approx(2 / 2**6) and known.is_gain_shown
+    assert unknown.gain_p is None and not unknown.is_gain_shown
+    assert any("pocket, error: " in line and "gain –: this may be chance" in line for line in explain(table))
+
+
 # -- the plan ----------------------------------------------------------------------------------------------------------
 
 

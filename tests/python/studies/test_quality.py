@@ -11,6 +11,7 @@ import sqlite3
 import subprocess
 import sys
 import time
+import tracemalloc
 from pathlib import Path
 
 import cv2
@@ -22,6 +23,7 @@ from locations import ROOT
 from scipy import stats
 
 import wiw
+from wiw.analysis import rank_correlation
 from wiw.analysis.quality import Sample, add_paper_quality, summarise_quality
 from wiw.analysis.rank_correlation import correlate, permutation_p, spearman
 from wiw.cli import main
@@ -156,6 +158,19 @@ def test_scenes_are_drawn_whole() -> None:
     once = correlate("m", success, values, np.arange(12))
     often = correlate("m", np.repeat(success, 4, 1), np.repeat(values, 4, 1), np.repeat(np.arange(12), 4))
     assert (often.rho, often.low, often.high) == pytest.approx((once.rho, once.low, once.high))
+
+
+def test_many_scenes_take_little_memory_and_blocks_are_the_draws_of_one(monkeypatch: pytest.MonkeyPatch) -> None:
+    rng = np.random.default_rng(4)
+    success, values, scenes = rng.random((4, 5000)), rng.random((4, 5000)), np.arange(5000)
+    monkeypatch.setattr(rank_correlation, "RESAMPLES", 50)
+    whole = correlate("m", success, values, scenes)
+    monkeypatch.setattr(rank_correlation, "BLOCK", 7 * 5000)
+    tracemalloc.start()
+    assert correlate("m", success, values, scenes) == whole
+    peak = tracemalloc.get_traced_memory()[1]
+    tracemalloc.stop()
+    assert peak < 10e6  # a matrix of scenes by scenes has 200 MB
 
 
 def test_no_order_no_coefficient() -> None:
