@@ -441,9 +441,11 @@ def make(task_id: str, depth: bool = True, **options: Any) -> Any:
     """Return a gymnasium environment of a task, e.g. `wiw.make("ImageNav-v0", scenes="apartments:val", seed=0)`.
 
     Observations carry depth unless `depth=False`: the matcher maps with it and `warp` imagines with it. Other things to
-    observe may be among the task's options (such as `cameras` for `Manipulation-v0`).
+    observe may be among the task's options (such as `cameras` for `Manipulation-v0`). A task of your own
+    ("path.py:Class") has whatever its `environment` returns: a `wiw.Env` need only `begin` and `run` episodes.
 
     Raises:
+        ArgumentError: something else than a name.
         RegistryError: unknown task, or options that do not fit; the message lists the known ones.
     """
     if options.pop("render_mode", None) not in (None, "rgb_array"):
@@ -480,5 +482,13 @@ def task_class(name: str) -> Any:
 def task_name(task_id: str) -> str:
     """Return the registered name of a gymnasium id: "imagenav" for "ImageNav-v0". Other names and paths are
     unchanged.
+
+    Raises:
+        ArgumentError: something else than a name.
     """
+    if not isinstance(task_id, str):
+        raise ArgumentError(
+            f"expected the name of a task, such as 'ImageNav-v0' or 'path.py:Class', got {task_id!r}; of a task that "
+            "exists, call `environment()`"
+        )
     return task_id if ":" in task_id or task_id in TASKS.names() else task_id.removesuffix("-v0").lower()
