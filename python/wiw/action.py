@@ -38,6 +38,7 @@ __all__ = [
     "PoseGrid",
     "TextTemplate",
     "chunk",
+    "count_leading_turns",
     "frames_of_actions",
     "pad",
     "parse_action",
@@ -125,6 +126,11 @@ class PoseGrid:
         position = low + (given[..., :3].clip(0, self.bins - 1) + 0.5) * (high - low) / self.bins
         rotation = (given[..., 3:6] % self.turns) * (2 * np.pi / self.turns) - np.pi
         return np.concatenate([position, rotation, given[..., 6:].clip(0, 1)], axis=-1)
+
+
+def count_leading_turns(actions: Sequence[int] | NDArray[np.int8]) -> int:
+    """Return how many turns, to whichever side, a plan of primitives begins with."""
+    return next((i for i, action in enumerate(actions) if action not in (TURN_LEFT, TURN_RIGHT)), len(actions))
 
 
 def to_text(

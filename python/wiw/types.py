@@ -244,6 +244,8 @@ class Goal:
     """Whether `text` is a question to be answered in words (`TextAnswer`)."""
     budget: int | None = None
     """Most primitives of the episode; None where the agent is not told."""
+    free_turns: bool = False
+    """Whether the turns that a decision's actions begin with do not count towards the budget."""
 
     @property
     def expects_answer(self) -> bool:
@@ -525,6 +527,14 @@ class Decision:
     """Questions to a language model, and its answers."""
     pictures: Mapping[str, NDArray[np.uint8]] = field(default_factory=dict)
     """Pictures of beliefs, uint8 [H, W, 3] by name (`Policy.draw`); empty if the record keeps no images."""
+
+    def __repr__(self) -> str:
+        scores = None if self.scores is None else np.round(self.scores, 3).tolist()
+        return (
+            f"{type(self).__name__}(actions={np.asarray(self.actions).tolist()}, execute={self.execute}, "
+            f"{len(self.proposals)} proposals, {len(self.rollouts or ())} rollouts, scores={scores}, "
+            f"chosen={self.chosen}; wiw.show draws it)"
+        )
 
 
 @dataclass(frozen=True)

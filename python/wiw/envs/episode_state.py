@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from wiw._core import env as _env
-from wiw.action import STOP, TURN_LEFT, TURN_RIGHT
+from wiw.action import STOP, count_leading_turns
 from wiw.datasets.worlds import World, world
 from wiw.envs.pointing import IDS, Pointing
 from wiw.errors import ArgumentError
@@ -214,11 +214,6 @@ class EpisodeState:
         if task.limit is not None:  # an agent that only turns for nothing, or only waits, must come to an end too
             return self.actions >= task.limit or self.decisions >= 2 * task.limit
         return self.decisions >= task.decisions if self.decisions else self.actions >= task.budget
-
-
-def count_leading_turns(plan: Any) -> int:
-    """Return how many turns a plan begins with."""
-    return next((i for i, action in enumerate(plan) if action not in (TURN_LEFT, TURN_RIGHT)), len(plan))
 
 
 def draw_episode(task: NavigationSpec, random: np.random.Generator) -> int:

@@ -79,11 +79,16 @@ class Agent(BaseAgent):
             ArgumentError: a dict whose images have boxes drawn on them, which world models must not see, or a
                 manipulator's, which lacks what policies need.
         """
+        query = Query(read_observation(observation), goal, key)
+        if simulator is None:
+            return self.decide_batch([query])[0]
         environments = LiveEnvironments()
-        if simulator is not None:
-            environments.add(key, ForkedEnvironment(simulator))
-        self.grant(environments)  # also without one: a fork of an earlier decision shows another place
-        return self.decide_batch([Query(read_observation(observation), goal, key)])[0]
+        environments.add(key, ForkedEnvironment(simulator))
+        self.grant(environments)
+        try:
+            return self.decide_batch([query])[0]
+        finally:
+            environments.remove(key)  # the next decision is made at another place
 
     @property
     def policy(self) -> Policy:

@@ -54,7 +54,8 @@ class AgentSpec:
                 space.check_search(model, policy, config.depth)
         observers = () if model is None else self.observers
         shown = None if model is None else model.accepts.at_size(choose_frames(policy, reviser, config).source_size)
-        return AgentParts(policy, imaginer, reviser, space, config, observers, EpisodeMemories(policy, reviser, shown))
+        memories = EpisodeMemories(policy, reviser, config, shown)
+        return AgentParts(policy, imaginer, reviser, space, config, observers, memories)
 
     def _make_reviser(self, policy: Policy, space: str, imagines: bool) -> Policy:
         if self.reviser is not None:
@@ -65,8 +66,8 @@ class AgentSpec:
             reviser = POLICIES.make(policy.default_revision, **space_option(POLICIES, policy.default_revision, space))
         else:
             raise ArgumentError(
-                f"Agent: policy {type(policy.unwrapped).__name__} only proposes; give a policy that scores as "
-                "`reviser=`"
+                f"Agent: policy {type(policy.unwrapped).__name__} only proposes; let it implement `score`, or name "
+                "a policy that scores with --revision (reviser=)"
             )
         check_declaration(reviser)
         if reviser.space != space:

@@ -24,9 +24,9 @@ class PlanConfig:
     """L, primitives or poses per plan. Default: the task's; 5 without a task. Does not change how many actions are
     executed per decision, unless plans become shorter than that."""
     execute: Annotated[int | None, arg(metavar="N")] = None
-    """Actions executed before the next decision; 0: the whole plan; negative: all of the plan's first `horizon` except
-    that many, but at least one. Default: the task's; L - 2 without a task. More than `horizon` matters only to policies
-    that decide on longer plans than are imagined."""
+    """Actions executed before the next decision; 0: the plan's first `horizon`, which is all of it unless `depth` or
+    the policy makes it longer; negative: all of these except that many, but at least one. Default: the task's; L - 2
+    without a task. More than `horizon` matters only where plans may be longer."""
     depth: Annotated[int, arg(metavar="N")] = 1
     """Levels of the beam search. The first chooses among the proposals; each further level extends the best plans by
     `horizon` actions, proposed by `Policy.extend` from their imagined ends."""

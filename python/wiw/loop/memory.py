@@ -10,6 +10,7 @@ from typing import Any
 from numpy.typing import NDArray
 
 from wiw.errors import ArgumentError
+from wiw.loop.config import AgentConfig
 from wiw.loop.contract import check_answerer
 from wiw.loop.history import EpisodeHistories
 from wiw.loop.imagination import Imaginer
@@ -29,6 +30,8 @@ class Query:
     """Azimuth, in the frame of the start, of what is up on maps of the scene. None: no pictures are kept of this
     decision. No decision depends on it: it is for `Policy.draw` alone.
     """
+    executed: tuple[Any, ...] | None = None
+    """Actions carried out since the episode began. None: all that were decided, where the asker does not say."""
 
 
 def read_observation(observation: Any) -> Observation | ArmObservation:
@@ -55,7 +58,7 @@ class EpisodeMemory:
     """Memory of the proposing policy; the reviser's too where one policy is both."""
     reviser: Any
     executed: list[Any] = field(default_factory=list)
-    """Actions of all decisions so far, as far as they were to be carried out."""
+    """Actions carried out so far; those of the latest decision as far as they are to be."""
 
 
 class EpisodeMemories:
@@ -64,11 +67,14 @@ class EpisodeMemories:
     Args:
         policy: that proposes.
         reviser: that scores.
+        config: complete; what policies are told of the search.
         accepts: declaration of the world model, in the size requested from it; None without one.
     """
 
-    def __init__(self, policy: Policy, reviser: Policy, accepts: Accepts | None) -> None:
+    def __init__(self, policy: Policy, reviser: Policy, config: AgentConfig, accepts: Accepts | None) -> None:
         self._policy, self._reviser = policy, reviser
+        longest = max(config.longest, reviser.longest_decision or 0)
+        self._limits = config.horizon, config.count_executed(longest)
         self.histories = EpisodeHistories(accepts)
         """What world models with a memory are shown."""
         self._by_episode: dict[tuple[int, int], EpisodeMemory] = {}
@@ -78,14 +84,16 @@ class EpisodeMemories:
         proposing, revising = [], []
         for query in queries:
             memory = self._begin_or_continue(query)
-            imagines = imaginer.consults(query.key)
+            if query.executed is not None:
+                memory.executed = list(query.executed)
             known = query.observation, query.goal, query.key
-            proposing.append(Situation(*known, memory.proposer, tuple(memory.executed), imagines))
-            revising.append(Situation(*known, memory.reviser, tuple(memory.executed), imagines))
+            executed, imagines = tuple(memory.executed), imaginer.consults(query.key)
+            proposing.append(Situation(*known, memory.proposer, executed, imagines, *self._limits))
+            revising.append(Situation(*known, memory.reviser, executed, imagines, *self._limits))
         return proposing, revising
 
     def record(self, key: Key, actions: NDArray[Any]) -> None:
-        """Record the actions that are about to be executed."""
+        """Record the actions that are about to be executed; the next query may know of fewer."""
         self._by_episode[key.seed, key.episode].executed += actions.tolist()
 
     def forget(self, key: Key) -> None:

@@ -47,11 +47,14 @@ class LiveEpisode:
     north: float | None = None
     """See `Query`."""
     decisions: int = 0
+    executed: list[Any] = field(default_factory=list)
+    """Actions carried out so far."""
     done: bool = field(default=False)
 
     def query(self) -> Query:
         """Return the episode's query to the agent."""
-        return Query(self.observation, self.env.goal, self.key.at(self.decisions), self.north)
+        key = self.key.at(self.decisions)
+        return Query(self.observation, self.env.goal, key, self.north, tuple(self.executed))
 
     def carry_out(self, decision: Decision) -> DecisionRecord:
         """Execute the decision's first segment and observe."""
@@ -62,6 +65,7 @@ class LiveEpisode:
         seconds = {**decision.seconds, "environment": time.perf_counter() - begin}
         decision = replace(decision, seconds=seconds)
         self.observation, self.done = outcome.observation, outcome.terminated or outcome.truncated
+        self.executed += outcome.executed.tolist()
         facts = outcome.executed, before, self.env.truth(), outcome.path, outcome.refused
         end = self.observation if self.done else None
         record = DecisionRecord(self.index, self.decisions, decision, *facts, end)

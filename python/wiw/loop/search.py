@@ -11,6 +11,7 @@ from __future__ import annotations
 
 from collections import Counter
 from collections.abc import Mapping, Sequence
+from dataclasses import replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -96,7 +97,8 @@ class Search:
             seed = core.fold_key([here.key.seed, self.level, candidate])
             key = Key(seed, here.key.episode, here.key.decision)
             observation = Observation(panorama, front, move(here.observation.odometry, actions))
-            ends.append(Situation(observation, here.goal, key, here.memory, (*here.executed, *actions.tolist())))
+            executed = (*here.executed, *actions.tolist())
+            ends.append(replace(here, observation=observation, key=key, executed=executed))
         return ends
 
 

@@ -50,6 +50,10 @@ class Situation:
     """Whether a world model will imagine the plans proposed now. If not, a policy that always takes its first plan
     needs to propose only one.
     """
+    horizon: int | None = None
+    """Maximum number of actions of a proposal; None if not known."""
+    execute: int | None = None
+    """Maximum number of actions executed before the next decision; None if not known."""
 
 
 class Policy(ABC):

@@ -47,7 +47,9 @@ class AEQARules:
     candidates: int
     """M, plans imagined per decision."""
     horizon: int
-    """L, actions per plan, where the turn that a plan begins with counts as one, whatever its angle."""
+    """L, actions per plan of policy `vlm`, where the turn that a plan begins with counts as one, whatever its angle.
+    Routes of `explorer` are not cut so: they have up to L - 1 + 8 primitives, and a world model of L - 1 actions a clip
+    needs two calls for one with more than that after its first turn."""
     execute: int
     """Maximum number of primitives carried out before the next decision. Plans have L - 1 + 8 at most; only routes that
     policy `vlm` decides on may have more (`longest_route`)."""
@@ -264,8 +266,9 @@ class AEQA(NavigationTask):
         return len(generate_available(place, most, self.seed, self.generator, attributes=self.attributes))
 
     def make_goal(self, place: World, episode: Episode) -> Goal:
-        """Return the question's text, nothing else of it, and the budget."""
-        return Goal(AEQA.name, text=read_question(episode).text, question=True, budget=self.budget)
+        """Return the question's text, nothing else of it, and the budget with what counts towards it."""
+        text = read_question(episode).text
+        return Goal(AEQA.name, text=text, question=True, budget=self.budget, free_turns=self.free_turns)
 
     def find_goal_position(self, place: World, episode: Episode) -> NDArray[np.float64]:
         """Return the viewpoint that is nearest to the start; the start itself where none is known."""

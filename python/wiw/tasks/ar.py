@@ -32,7 +32,8 @@ class ARRules:
     horizon: int
     """L, primitives per plan."""
     execute: Literal["primitive", "sequence"]
-    """Whether the first primitive of the chosen plan is carried out before the next decision, or all of it."""
+    """What is carried out of the chosen plan before the next decision: its first primitive, or its first L, which are
+    all of it unless a search of several levels has extended it."""
     confidence: float
     """An answer more probable than this, before it is normalised (`Answer.confidence`), ends the episode at once."""
     prediction: Literal["last", "surest"]

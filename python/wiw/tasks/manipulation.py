@@ -158,7 +158,7 @@ class Manipulation(ManipulationSpec, Task):
         return [self.episode(index) for index in range(count)]
 
     def episode(self, index: int) -> Episode:
-        """Return an episode by its number, each with a table of its own; variations are drawn by the seed.
+        """Return an episode by its number, each with a table of its own, laid by the seed; variations take turns.
 
         Raises:
             ArgumentError: a number below 0.

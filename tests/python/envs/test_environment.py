@@ -229,6 +229,7 @@ def test_no_privileged_truth_reaches_policies_or_models(two_rooms: str) -> None:
                         "image",
                         "text",
                         "budget",
+                        "free_turns",
                         "choices",
                         "question",
                     )

@@ -294,7 +294,26 @@ def test_a_dense_path_leads_through_its_poses_and_is_thinned_to_them() -> None:
     np.testing.assert_array_equal(paths.drop_repeated_poses(HERE, HERE[None]), HERE[None])
 
 
+@pytest.mark.parametrize("most", [5, 10])
+def test_rounding_does_not_decide_which_poses_are_kept(most: int) -> None:
+    """A path of straight moves has fewer poses that its shape needs than it is thinned to."""
+    stops = HERE + np.array([[0.1, 0, 0, 0, 0, 0, 0], [0.1, 0.2, 0, 0, 0, 0.3, 0]])
+    path = paths.densify_path(HERE, stops, 50)
+    thin = paths.thin_path(HERE, path, most)
+    assert len(np.unique(thin, axis=0)) == most and (np.linalg.norm(thin - stops[0], axis=1) < 1e-9).any()
+    for seed in range(5):
+        noise = 1e-9 * np.random.default_rng(seed).standard_normal(path.shape)
+        np.testing.assert_allclose(paths.thin_path(HERE, path + noise, most), thin, atol=1e-7)
+
+
 # -- the policy --------------------------------------------------------------------------------------------------------
+
+
+def test_a_plan_does_not_depend_on_how_many_others_are_proposed(shown: list[Demonstration]) -> None:
+    policy, one = make_untrained(), situation(shown[0], Key(3, 1))
+    for horizon in (5, 50):
+        alone, beside = (policy.propose([one], count, horizon)[0][0].actions for count in (1, 5))
+        np.testing.assert_allclose(alone, beside, atol=1e-4)
 
 
 def test_candidates_differ_and_are_functions_of_the_key(shown: list[Demonstration]) -> None:

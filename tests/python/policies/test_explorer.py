@@ -48,7 +48,7 @@ from wiw.runs.recipes import AgentRecipe, TaskRecipe
 from wiw.scenes import apartment_table
 from wiw.tasks.aeqa import AEQA
 from wiw.training.home_knowledge import count_homes, write_knowledge
-from wiw.types import Goal, Key, Proposal, Rollout, TextAnswer
+from wiw.types import Goal, Key, Observation, Proposal, Rollout, TextAnswer
 
 PALETTE = {
     "white": (230, 228, 222), "grey": (128, 128, 128), "black": (30, 30, 30), "brown": (110, 75, 45),
@@ -405,6 +405,22 @@ def test_time_that_is_nearly_up_makes_any_belief_final(episode, budget, actions)
     run_episodes(task, wiw.Agent(policy, **task.defaults), [(0, episode)], seed=0, live=1, sink=sink)
     assert [each.final for each in sink.answers[:1]] == [False] and sink.answers[-1].final
     assert sink.results[0].metrics["answered"] == 1
+
+
+@pytest.mark.parametrize(
+    ("free_turns", "execute", "most"), [(False, None, 18), (False, 15, 18), (True, 15, 18), (True, 21, 24)]
+)
+def test_the_budget_is_counted_as_the_task_counts_it(free_turns, execute, most):
+    policy, walked = make_explorer(sure=1.1), [int(TURN_LEFT)] * 4 + [int(FORWARD), int(TURN_LEFT)]
+    goal = Goal("aeqa", text="q", question=True, budget=30, free_turns=free_turns)
+    memory, finals = policy.begin(goal, Key(0, 0)), []
+    memory.azimuth, memory.destinations = 0.0, [Destination(np.zeros(2), 1.0)]
+    for decision in range(5):
+        place = Observation(np.zeros((576, 1024, 3), np.uint8), np.zeros((480, 480, 3), np.uint8), np.zeros(3))
+        situation = Situation(place, goal, Key(0, 0, decision), memory, tuple(walked * decision), execute=execute)
+        policy._follow(situation)
+        finals.append(policy.is_final(situation))
+    assert finals == [30 - (2 if free_turns else 6) * decision <= most for decision in range(5)]
 
 
 @pytest.mark.parametrize(

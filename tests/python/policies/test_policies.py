@@ -229,7 +229,6 @@ def test_a_plan_of_which_only_the_turn_was_carried_out_marks_nothing() -> None:
     for executed in ((int(TURN_LEFT),), (int(TURN_LEFT), int(FORWARD))):
         policy = Matcher()
         memory = policy.begin(goal, Key(0, 0))
-        memory.last_plan = np.array([TURN_LEFT, FORWARD, FORWARD], np.int8)
         for done, azimuth in (((), 0.0), (executed, np.pi / 8)):
             shown = Observation(noise(576, 1024, 3), BLANK.front, np.array([0.0, 0.0, azimuth]), depth)
             policy.observe([Situation(shown, goal, Key(0, 0), memory, done)])

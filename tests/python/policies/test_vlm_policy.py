@@ -29,7 +29,7 @@ from wiw.policies.vlm.prompts.templates import FOLDER, SLOTS, Prompts
 from wiw.runs.recipes import AgentRecipe
 from wiw.serving.vlm_server import VlmServer
 from wiw.studies.evaluate import evaluate
-from wiw.types import Rollout
+from wiw.types import Proposal, Rollout
 from wiw.vlm.messages import Call
 from wiw.vlm.mock import MockClient
 
@@ -200,6 +200,20 @@ def test_a_plan_may_be_written_anew_or_chosen(two_rooms: str) -> None:
     assert decision.actions.tolist() == [LEFT, FORWARD] and decision.chosen == 1
     np.testing.assert_allclose(decision.scores, [0.3, 0.6, 0.1])
     assert "B. plan 2: turn_left, forward" in words(chooser.calls[-1])
+
+
+class OneStep(wiw.Policy):
+    """Proposes one step forward."""
+
+    def propose(self, situations: Any, candidates: int, horizon: int) -> Any:
+        return [[Proposal(np.array([FORWARD], np.int8))] for _ in situations]
+
+
+def test_a_reviser_may_write_longer_plans_than_are_proposed(two_rooms: str) -> None:
+    client = MockClient(script)
+    decision = decide_in(imagenav(two_rooms), OneStep(), "copy", reviser=VLM(client), horizon=4)
+    assert "next 4 action(s)" in words(client.calls[-1])
+    assert decision.actions.tolist() == [FORWARD, FORWARD, LEFT] and decision.chosen is None
 
 
 def test_plans_may_be_listed_in_one_answer(two_rooms: str) -> None:

@@ -44,7 +44,7 @@ from wiw.runs.recipes import AgentRecipe
 from wiw.serving.vlm_server import VlmServer
 from wiw.tasks import presets
 from wiw.tasks.aeqa import AEQA
-from wiw.types import Key
+from wiw.types import Key, Proposal
 from wiw.vlm.messages import Call, Completion
 from wiw.vlm.mock import MockClient
 from wiw.vlm.structured import parse_object
@@ -123,6 +123,11 @@ def test_commands_walks_and_answers_are_read_in_harmless_variations() -> None:
     assert parse(schema, unreasoned).reason == "" and "chosen_view" in parse(schema, command("front left"))
     silent = commands.command_schema((1,), answers=False)
     assert parse(silent, command(answer="none")).action_plan == "Go on.", "null says nothing"
+    spelled = {key.replace("_", " ").title(): value for key, value in command("Left", 4, "red").items()}
+    assert "Chosen Landmark" in spelled and parse(schema, spelled) == parse(schema, command("left", 4, "red"))
+    assert "Answer" in parse(schema, command(answer="red") | {"Answer": "blue"})
+    del spelled["Answer"]
+    assert "answer" in parse(schema, spelled | {"ANSWER": "red", "Answer": "red"}), "two spellings of one field"
     steps = {"actions": [{"action": "Turn Left", "times": 2, "why": "a wall"}, {"action": "STOP", "times": 1}]}
     assert commands.parse_walk(parse(commands.walk_schema(), steps)).tolist() == [LEFT] * 2
     assert "action_plan" in parse(schema, {"chosen_view": "front", "chosen_landmark": None, "answer": None})
@@ -433,6 +438,20 @@ def test_a_reviser_may_only_choose(two_rooms: str) -> None:
     decision = decide(two_rooms, policy, "copy")
     assert decision.chosen == 1 and np.allclose(decision.scores, [0.2, 0.7, 0.1])
     assert "B. plan 2" in words(policy.client.calls[-1])
+
+
+class OneStep(wiw.Policy):
+    """Proposes one step forward."""
+
+    def propose(self, situations: Any, candidates: int, horizon: int) -> Any:
+        return [[Proposal(np.array([int(FORWARD)], np.int8))] for _ in situations]
+
+
+def test_a_reviser_may_command_more_than_is_proposed(two_rooms: str) -> None:
+    far = [("forward", 4), ("turn_left", 1), ("forward", 4)]
+    reviser = make_policy(Script(command(), revision=without_answer(command("right")), steps=far))
+    decision = decide(two_rooms, OneStep(), "copy", reviser=reviser)
+    assert len(decision.actions) == 4 + 9
 
 
 def test_plans_may_be_listed_in_one_answer(two_rooms: str) -> None:

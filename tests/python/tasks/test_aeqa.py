@@ -320,6 +320,26 @@ def run(task: AEQA, policy: Policy, episodes: list[Episode]) -> Records:
     return sink
 
 
+def test_agents_know_what_was_really_carried_out(episode):
+    """Nothing is after a final answer that is to be confirmed on the same view."""
+    known: dict[tuple[int, int], Any] = {}
+
+    class Doubting(Talker):
+        def propose(self, situations, candidates, horizon):
+            known.update({(each.key.episode, each.key.decision): each for each in situations})
+            return super().propose(situations, candidates, horizon)
+
+        def answer(self, situations, proposals, rollouts):
+            return [final() if each.key.decision == 0 else TextAnswer() for each in situations]
+
+    task = make_task(episode, preset="official", actions=2)
+    sink = run(task, Doubting(None), [episode, replace(episode, episode_id="0001")])
+    assert [result.status for result in sink.results] == ["done"] * 2
+    for index in range(2):
+        assert [len(known[index, decision].executed) for decision in range(4)] == [0, 0, 15, 30]
+        assert known[index, 0].goal.free_turns and known[index, 0].horizon == known[index, 0].execute == 21
+
+
 @pytest.mark.parametrize(
     ("says", "expected"),
     [

@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from wiw.envs.episode_state import count_leading_turns
+from wiw.action import count_leading_turns
 from wiw.envs.navigation import NavigationEnv
 from wiw.errors import ArgumentError
 from wiw.experiments.errors.base import Degradation

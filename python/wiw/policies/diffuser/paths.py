@@ -22,6 +22,8 @@ METRES_PER_RADIAN = 0.1
 """Metres that a rotation by one radian counts as, where a path's shape is measured."""
 MIN_MOVE = 0.015
 """Metres; a shorter move counts as none."""
+DEVIATION_DIGITS = 6
+"""Decimals that count of a deviation in metres; what is less is rounding, which depends on machine and batch."""
 
 Path = NDArray[np.float64]
 
@@ -55,7 +57,7 @@ def thin_path(start: NDArray[np.float64], path: Path, most: int) -> Path:
     """Choose `most` poses of a path [L, 7] that keep its shape, or all of them where there are fewer.
 
     These are its last pose, those where the gripper opens or closes, and then, one by one, those where straight moves
-    deviate most from the path.
+    deviate most from the path. Where none deviate, they are in the middle of the longest moves.
     """
     if len(path) <= most:
         return path
@@ -66,8 +68,17 @@ def thin_path(start: NDArray[np.float64], path: Path, most: int) -> Path:
         if len(kept) <= most and change not in kept:
             kept.append(int(change))
     while len(kept) <= most:
-        kept.append(int(np.argmax(_measure_deviation(stops, sorted(kept)))))
+        kept.append(_choose_next(stops, sorted(kept)))
     return stops[sorted(kept)[1:]]
+
+
+def _choose_next(stops: Path, kept: list[int]) -> int:
+    """Return the first of the poses that deviate most; the middle of the longest move where none does."""
+    deviation = _measure_deviation(stops, kept).round(DEVIATION_DIGITS)
+    if deviation.max() > 0:
+        return int(deviation.argmax())
+    longest = int(np.diff(kept).argmax())
+    return (kept[longest] + kept[longest + 1]) // 2
 
 
 def _measure_deviation(stops: Path, kept: list[int]) -> NDArray[np.float64]:

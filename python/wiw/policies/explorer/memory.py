@@ -51,7 +51,9 @@ class Memory:
     pose: NDArray[np.float64] = field(default_factory=lambda: np.zeros(3))
     """x, y, azimuth in the map at the last decision."""
     executed: int = 0
-    """Primitives until then."""
+    """Primitives until then ..."""
+    spent: int = 0
+    """... as far as they count towards the budget."""
     destinations: list[Destination] = field(default_factory=list)
     """Places worth going to from there, the most worth first."""
     tries: Counter[tuple[int, int]] = field(default_factory=Counter)

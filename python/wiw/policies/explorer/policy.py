@@ -15,7 +15,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from wiw.action import TURN_LEFT
+from wiw.action import TURN_LEFT, count_leading_turns
 from wiw.datasets.questions import parse
 from wiw.errors import ArgumentError
 from wiw.mapping.alignment import turn_odometry
@@ -43,8 +43,8 @@ LOOK_AROUND = 4
 """Left turns where no way leads anywhere: a quarter turn."""
 MOST_GAIN = 12.0
 """Square metres of new floor that count at most: one room. More would draw an agent to and fro across a home."""
-LAST_ACTIONS = 18
-"""Primitives left from which on an answer is final: those of one more decision, and of the look that confirms it."""
+USUAL_EXECUTE = 15
+"""Primitives of a decision at most, where the agent's number is not known."""
 CLEAR_SHARE = 0.01
 """Share of a view that a wanted thing must fill in an imagined view to count in full."""
 
@@ -60,8 +60,8 @@ class Explorer(Policy):
         imagination: weight of what imagined views show, in the units of a destination's worth (square metres).
         path: worth of a metre that need not be walked, in square metres of new floor.
         affinity: worth of a room that is likely to have what is asked about.
-        budget: primitives of an episode; with its last segment the agent answers, whatever its confidence. None: the
-            task's.
+        budget: primitives of an episode, counted as the task counts them; with its last segment the agent answers,
+            whatever its confidence. None: the task's.
 
     Raises:
         ArgumentError: a labeller that needs the simulator's instance ids, or an option that is no number, or none of
@@ -139,7 +139,7 @@ class Explorer(Policy):
                 memory.grid.add(look.depth, pose)
                 memory.objects.add(views, labels, self.name_color)
                 memory.surfaces += self._look_at_surfaces(views, labels)
-            self._mark_refused(situation)
+            self._follow(situation)
             memory.home = believe_home(memory.objects, memory.grid, memory.surfaces, self.knowledge)
             memory.belief = self._answer_from_map(memory, situation.goal.text or "")
             memory.choose_destinations(partial(self._rate, memory))
@@ -158,14 +158,14 @@ class Explorer(Policy):
                 looks.append(Surface(name, point[:2], color, confidence))
         return looks
 
-    def _mark_refused(self, situation: Situation) -> None:
-        """Mark the obstacles met since the last decision, and note where the agent is now."""
-        memory = situation.memory
+    def _follow(self, situation: Situation) -> None:
+        """Note where the agent is now and what that took of the budget, and mark the obstacles met on the way."""
+        memory, walked = situation.memory, situation.executed[situation.memory.executed :]
         pose = turn_odometry(situation.observation.odometry, memory.azimuth)
-        if memory.executed < len(situation.executed):
-            blocked = find_refused(memory.pose, situation.executed[memory.executed :], pose)
-            if blocked is not None:
-                memory.grid.mark_blocked(blocked, STEP)
+        blocked = find_refused(memory.pose, walked, pose) if walked else None
+        if blocked is not None:
+            memory.grid.mark_blocked(blocked, STEP)
+        memory.spent += len(walked) - (count_leading_turns(walked) if situation.goal.free_turns else 0)
         memory.pose, memory.executed = pose, len(situation.executed)
 
     def look_around(self, situation: Situation) -> Iterator[Look]:
@@ -291,7 +291,8 @@ class Explorer(Policy):
         """Return whether the present belief is the answer: it is sure enough, nothing is left to see, or no time."""
         memory = situation.memory
         budget = situation.goal.budget if self.budget is None else self.budget
-        is_ending = budget is not None and budget - len(situation.executed) <= LAST_ACTIONS
+        needed = (situation.execute or USUAL_EXECUTE) + LOOK_ACTIONS  # for one more decision, and to confirm its answer
+        is_ending = budget is not None and budget - memory.spent <= needed
         return bool(memory.belief.confidence >= self.sure or not memory.destinations or is_ending)
 
 

@@ -86,8 +86,6 @@ class Memory:
     """Position in the start frame and similarity of every imagined place."""
     recalled_gains: dict[bytes, float] = field(default_factory=dict)
     """By plan proposed last: the gain in similarity that earlier imagination promised for it."""
-    last_plan: NDArray[np.int8] | None = None
-    """The plan chosen last; if it did not move the agent, something unseen is in the way."""
     executed: int = 0
     """Primitives that had been executed at the latest observation."""
     places: list[tuple[NDArray[np.float64], float]] = field(default_factory=list)
@@ -133,7 +131,7 @@ class Matcher(Policy):
             observation = situation.observation
             assert observation.depth is not None
             executed, memory.executed = situation.executed[memory.executed :], len(situation.executed)
-            if memory.last_plan is not None and FORWARD in memory.last_plan[:2] and FORWARD in executed:
+            if FORWARD in executed[:2]:  # where the agent has not moved, something unseen is in the way
                 memory.map.mark_blocked(observation.odometry)
             memory.map.update(_sample_depth(observation.depth), observation.odometry, likeness)
             memory.places.append((observation.odometry, memory.similarity))
@@ -170,13 +168,6 @@ class Matcher(Policy):
                 surprises.append(0.0 if gain is None else gain - memory.recalled_gains.get(plan.actions.tobytes(), 0.0))
             scores.append(np.array([plan.prior for plan in plans]) + self._weight(memory) * np.array(surprises))
         return scores
-
-    def revise(
-        self, situation: Situation, proposals: Sequence[Proposal], scores: NDArray[np.float64]
-    ) -> tuple[NDArray[np.int8], int | None]:
-        """Return the best plan; remember it, to notice whether it moves the agent."""
-        situation.memory.last_plan, chosen = super().revise(situation, proposals, scores)
-        return situation.memory.last_plan, chosen
 
     def _require_goal_image(self, goal: Goal) -> NDArray[np.uint8]:
         if goal.image is None:

@@ -1,14 +1,15 @@
 # SPDX-License-Identifier: Apache-2.0
 """Schemas of answers, which servers receive in full, and the harmless variations in which models write them.
 
-An answer may have further keys, lack its reasons, and write a name with capitals or spaces. What is ambiguous is not
-read: a further key that differs from an expected one only by its case, or a name outside the vocabulary.
+An answer may have further keys, lack its reasons, and write a key or a name with capitals or spaces. What is ambiguous
+is not read: two keys that are spellings of one field, or a name outside the vocabulary.
 """
 
 from __future__ import annotations
 
 import math
 import re
+from collections import Counter
 from collections.abc import Sequence
 from typing import TYPE_CHECKING, Annotated, Any, Literal
 
@@ -73,13 +74,16 @@ def _read_keys(
     values: dict[str, Any], fields: dict[str, Any], reasons: Sequence[str], refused: Sequence[str]
 ) -> dict[str, Any]:
     """Return the values of the fields, and of further keys only those that make the answer unreadable."""
-    expected = {_fold_name(name) for name in fields}
-    kept = {
-        key: value
-        for key, value in values.items()
-        if key in fields or _fold_name(key) in expected or (key in refused and read_null(value) is not None)
-    }
-    return {**dict.fromkeys((name for name in reasons if _fold_name(name) not in map(_fold_name, values)), ""), **kept}
+    known = {_fold_name(name): name for name in fields}
+    spellings = Counter(map(_fold_name, values))
+    kept = {}
+    for key, value in values.items():
+        folded = _fold_name(key)
+        if folded in known:
+            kept[known[folded] if spellings[folded] == 1 else key] = value
+        elif key in refused and read_null(value) is not None:
+            kept[key] = value
+    return {**dict.fromkeys((name for name in reasons if _fold_name(name) not in spellings), ""), **kept}
 
 
 def _fold_name(name: str) -> str:

@@ -234,8 +234,9 @@ class VLM(Policy):
         return Memory()
 
     def observe(self, situations: Sequence[Situation]) -> None:
-        """Start the record of a decision anew."""
+        """Start the record of a decision anew, with the horizon of a policy that only revises."""
         for situation in situations:
+            situation.memory.horizon = situation.horizon or 1
             self._journal.pop((situation.key.episode, situation.key.decision), None)
 
     # -- plans ---------------------------------------------------------------------------------------------------------
