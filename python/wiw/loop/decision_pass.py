@@ -14,10 +14,10 @@ from numpy.typing import NDArray
 from wiw.loop.config import AgentConfig
 from wiw.loop.contract import (
     check_answers,
-    check_chosen,
     check_observations,
     check_pictures,
     check_proposals,
+    check_revision,
     check_scores,
 )
 from wiw.loop.imagination import Imagination, Imaginer, ModelInput, NoImagination, Request
@@ -214,10 +214,10 @@ class DecisionPass:
         self, episode: int, plans: Sequence[Proposal], scores: NDArray[np.float64]
     ) -> tuple[NDArray[Any], int | None]:
         reviser, config = self._parts.reviser, self._parts.config
-        actions, chosen = reviser.revise(self._revising[episode], plans, scores)
+        actions, chosen = check_revision(reviser, reviser.revise(self._revising[episode], plans, scores), len(plans))
         source = f"{type(reviser.unwrapped).__name__}.revise"
         longest = max(config.longest, reviser.longest_decision or 0)
-        return self._parts.space.check_plan(source, actions, longest), check_chosen(reviser, chosen, len(plans))
+        return self._parts.space.check_plan(source, actions, longest), chosen
 
     def _list_policies(self) -> list[Policy]:
         policy, reviser = self._parts.policy, self._parts.reviser

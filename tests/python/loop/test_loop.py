@@ -195,6 +195,7 @@ def test_a_decision_keeps_its_evidence(task: ImageNav) -> None:
     np.testing.assert_array_equal(record.executed, decision.actions[: len(record.executed)])
     assert [len(r.frames) for r in decision.rollouts] == [3, 2, 2, 1]
     assert decision.rollouts[2].real.all() and not decision.rollouts[3].real.any()
+    assert "4 proposals, 4 rollouts" in repr(decision) and len(repr(decision)) < 300
 
 
 def test_without_a_model_the_policy_takes_its_own_best(task: ImageNav) -> None:
@@ -323,6 +324,16 @@ def test_policies_declare_what_they_need_in_known_words() -> None:
 def test_policies_are_held_to_their_contract(task: ImageNav, careless: Careless, said: str) -> None:
     with pytest.raises(ContractError, match=said):
         run(task, wiw.Agent(careless, Stamp()), count=1)
+
+
+@pytest.mark.parametrize("revision", [Proposal([FORWARD]), np.array([FORWARD, FORWARD]), ([FORWARD],), None])
+def test_a_reviser_returns_a_plan_and_its_number(task: ImageNav, revision: object) -> None:
+    class Vague(Greedy):
+        def revise(self, situation, proposals, scores):
+            return revision
+
+    with pytest.raises(ContractError, match=r"Vague\.revise: expected \(actions, number of the proposal, or"):
+        run(task, wiw.Agent(Vague(), Stamp()), count=1)
 
 
 def test_models_are_refused_that_ask_for_what_nobody_gives() -> None:
@@ -502,6 +513,12 @@ def test_asking_for_the_impossible_says_so(task: ImageNav) -> None:
         wiw.Agent(Greedy(), "warp").decide(observation, env.goal, wiw.types.Key(0, 0))
     with pytest.raises(ArgumentError, match="simulator"):
         wiw.Agent(Greedy(), "oracle").decide(observation, env.goal, wiw.types.Key(0, 0))
+
+    class Proposing(wiw.Policy):
+        propose = Greedy.propose
+
+    with pytest.raises(ArgumentError, match=r"only proposes; let it implement `score`, or .* --revision \(reviser=\)"):
+        wiw.Agent(Proposing(), "copy")
 
 
 class Quiz(Greedy):
