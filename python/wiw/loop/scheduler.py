@@ -78,12 +78,15 @@ def _open_environment(task: Any, needs: Collection[str]) -> Any:
 
     Raises:
         ArgumentError: the agent needs the view of a wrist camera, and the task has no cameras.
+        ContractError: the task returns none.
     """
-    if "wrist" not in needs:
-        return task.environment(depth="depth" in needs)
-    if "cameras" not in task.sensor_options:
+    cameras: dict[str, Any] = {"cameras": ("wrist",)} if "wrist" in needs else {}
+    if cameras and "cameras" not in task.sensor_options:
         raise ArgumentError(f"this agent needs the view of a wrist camera, which task '{task.name}' does not have")
-    return task.environment(depth="depth" in needs, cameras=("wrist",))
+    env = task.environment(depth="depth" in needs, **cameras)
+    if env is None:
+        raise ContractError(f"{type(task).__name__}.environment: expected a wiw.Env, got None")
+    return env
 
 
 def run_episodes(

@@ -12,7 +12,7 @@ from pathlib import Path
 from typing import Any
 
 from wiw.analysis.stopping import StopRule, parse_stop_rule
-from wiw.errors import ArgumentError, Error, StoreError
+from wiw.errors import ArgumentError, ContractError, Error, StoreError
 from wiw.loop import keys
 from wiw.metrics import Lpips
 from wiw.runs.config import EngineConfig, ResumeConfig, RunConfig, name_folder, read_resume_settings, take_settings
@@ -124,8 +124,8 @@ def _hint_at_settings(options: Iterable[str]) -> Iterator[None]:
         hints = [did_you_mean(name, names) for name in options if name in str(error).partition(";")[0]]
         if not any(hints):
             raise
-        end = "" if str(error).endswith((".", "?")) else "."
-        raise ArgumentError(f"{error}{end}{next(filter(None, hints))} That is a setting of the run.") from None
+        end, hint = "" if str(error).endswith((".", "?")) else ".", next(filter(None, hints)).removesuffix("?")
+        raise ArgumentError(f"{error}{end}{hint}, of the run's settings?") from None
 
 
 def resume_run(
@@ -212,7 +212,7 @@ def _run(task: Any, agents: Mapping[str, Any], settings: RunConfig, more_arms: b
             _add_arms(store, config, _describe_agents(task, agents, built, count))
     else:
         started, salt = time.perf_counter(), _choose_salt(settings)
-        episodes, pictured = built.episodes(count), settings.count_pictured(count)
+        episodes, pictured = _list_episodes(built, count), settings.count_pictured(count)
         used = built.require(episodes)
         folder = settings.out or name_folder(built.name)
         info = {
@@ -325,6 +325,20 @@ def _finish(
     looks = None if "stopped" in info else _make_looks(info.get("until"), list(agents))
     run_pending(store, task, agents, pending, workers, progress, place, looks)
     return RunLog(RunStore.read(home))
+
+
+def _list_episodes(task: Any, count: int) -> list[Episode]:
+    """Return a task's first `count` episodes.
+
+    Raises:
+        ContractError: the task returns another number of them, or something else.
+    """
+    found = list(task.episodes(count))
+    if len(found) != count or not all(isinstance(each, Episode) for each in found):
+        kinds = ", ".join(sorted({type(each).__name__ for each in found})) or "none"
+        name = f"{type(task).__name__}.episodes"
+        raise ContractError(f"{name}: expected {count} of wiw.types.Episode, got {len(found)}: {kinds}")
+    return found
 
 
 def _make_looks(until: Mapping[str, Any] | None, arms: Sequence[str]) -> StopRule | None:

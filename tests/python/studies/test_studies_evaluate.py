@@ -213,12 +213,12 @@ def test_numbers_of_numpy_are_numbers(tmp_path):
 def test_a_misspelt_setting_is_told_from_an_option_of_the_task(misspelt, meant):
     for task in ("imagenav", LineTask()):
         with pytest.raises(
-            ArgumentError, match=f"'?{misspelt}'?.* Among the settings of the run: Did you mean {meant}"
+            ArgumentError, match=rf"'?{misspelt}'?.*\w[.?] Did you mean {meant}.*, of the run's settings\?$"
         ):
             evaluate(task, LineAgent(), **{misspelt: 1})
     with pytest.raises(ArgumentError) as error:
         evaluate("imagenav", LineAgent(), decision=1)
-    assert "Did you mean decisions" in str(error.value) and "settings of the run" not in str(error.value)
+    assert "Did you mean decisions" in str(error.value) and "run's settings" not in str(error.value)
 
 
 def test_arguments_are_checked(tmp_path):
@@ -525,3 +525,24 @@ def test_runs_that_begin_in_the_same_second_have_folders_of_their_own(tmp_path, 
     for _ in range(2):
         run(None, episodes=1).close()
     assert len({log.parent for log in Path("runs").glob("*/run.sqlite")}) == 2
+
+
+def test_a_task_is_held_to_its_contract(tmp_path):
+    class Careless(LineTask):
+        def __init__(self, episodes, is_placeless=False):
+            super().__init__()
+            self._episodes, self._is_placeless = episodes, is_placeless
+
+        def episodes(self, count):
+            return super().episodes(count) if self._episodes is None else self._episodes
+
+        def environment(self, depth=False):
+            return None if self._is_placeless else super().environment(depth)
+
+    for task, said in (
+        (Careless([]), r"Careless\.episodes: expected 8 of wiw\.types\.Episode, got 0: none"),
+        (Careless([1] * 8), "expected 8 .*got 8: int"),
+        (Careless(None, is_placeless=True), r"Careless\.environment: expected a wiw\.Env, got None"),
+    ):
+        with pytest.raises(ContractError, match=said):
+            run(tmp_path / str(len(said)), task=task)
