@@ -531,7 +531,7 @@ class Decision:
     def __repr__(self) -> str:
         scores = None if self.scores is None else np.round(self.scores, 3).tolist()
         return (
-            f"{type(self).__name__}(actions={np.asarray(self.actions).tolist()}, execute={self.execute}, "
+            f"{type(self).__name__}(actions={np.round(self.actions, 3).tolist()}, execute={self.execute}, "
             f"{len(self.proposals)} proposals, {len(self.rollouts or ())} rollouts, scores={scores}, "
             f"chosen={self.chosen}; wiw.show draws it)"
         )

@@ -56,8 +56,8 @@ class TaskFlags:
     allow_missing_textures: bool = False
     """Run on scans even if more than 5 % of the surface lacks its texture and is drawn grey."""
 
-    def make_recipe(self, task: str, seed: int) -> TaskRecipe:
-        """Return the recipe of a task.
+    def make_recipe(self, task: str, seed: int | None) -> TaskRecipe:
+        """Return the recipe of a task; without a seed, that of a task that takes one has 0.
 
         Raises:
             ArgumentError: a task option that has a flag of its own, or that cannot be read.
@@ -69,7 +69,7 @@ class TaskFlags:
             allow_missing_textures()
         here = ("task_option", "allow_missing_textures")
         flags = {name: value for name, value in vars(self).items() if name not in here}
-        return TaskRecipe(task, task_options(task, self.task_option, {**flags, "seed": seed}))
+        return TaskRecipe(task, task_options(task, self.task_option, {**flags, "seed": seed})).with_default_seed()
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -3,6 +3,7 @@
 
 from __future__ import annotations
 
+import io
 import math
 from collections.abc import Mapping, Sequence
 
@@ -13,7 +14,7 @@ from wiw.analysis.quality import CONTROL, PAPER_QUALITY, QualityTable
 from wiw.analysis.rank_correlation import Correlation
 from wiw.analysis.statistics import Estimate
 from wiw.analysis.summary import show_estimate, show_p
-from wiw.report.tables import ROOMY, Column, print_stacked, show_count, stack_tables
+from wiw.report.tables import ROOMY, Column, show_count, stack_tables
 
 ABOUT = {
     "SSIM": "Controllability: structural similarity of imagined and true frames, 1 for equal ones.",
@@ -67,12 +68,15 @@ def explain(table: QualityTable) -> list[str]:
 
 def print_quality(table: QualityTable) -> None:
     """Print the table of arms, the rank correlations, and what to bear in mind."""
-    titles, rows = arm_rows(table)
-    print_stacked("Imagined frames and success", [line.arm for line in table.arms], titles, rows)
-    _print_ranks(table.correlations, table.outcome)
-    console = _console()
-    for note in explain(table):
-        console.print(Text(note, style="dim"))
+    console = Console()
+    _print_to(Console(width=None if console.is_terminal else max(console.width, ROOMY)), table)
+
+
+def as_text(table: QualityTable) -> str:
+    """Return what `print_quality` prints as plain text."""
+    console = Console(width=ROOMY, file=io.StringIO(), record=True, force_jupyter=False)
+    _print_to(console, table)
+    return console.export_text()
 
 
 def label_measure(table: QualityTable, measure: str) -> str:
@@ -84,17 +88,20 @@ def label_measure(table: QualityTable, measure: str) -> str:
     return f"{role}: {measure}" + (f" ({scale})" if scale else "")
 
 
-def _print_ranks(found: Sequence[Correlation], outcome: str) -> None:
-    rows = [show_rank(one) for one in found]
-    columns = [Column(title, [row[index] for row in rows]) for index, title in enumerate(RANK_TITLES)]
-    title, console = f"Rank correlation with {outcome} over arms", _console()
-    for table in stack_tables(title, [one.measure for one in found], columns, console.width, "measure"):
-        console.print(table)
+def _print_to(console: Console, table: QualityTable) -> None:
+    titles, rows = arm_rows(table)
+    arms, measures = [line.arm for line in table.arms], [one.measure for one in table.correlations]
+    ranks, outcome = [show_rank(one) for one in table.correlations], f"Rank correlation with {table.outcome} over arms"
+    for each in (
+        *stack_tables("Imagined frames and success", arms, _columns(titles, rows), console.width),
+        *stack_tables(outcome, measures, _columns(RANK_TITLES, ranks), console.width, "measure"),
+        *(Text(note, style="dim") for note in explain(table)),
+    ):
+        console.print(each)
 
 
-def _console() -> Console:
-    console = Console()
-    return Console(width=None if console.is_terminal else max(console.width, ROOMY))
+def _columns(titles: Sequence[str], rows: Sequence[Sequence[str]]) -> list[Column]:
+    return [Column(title, [row[index] for row in rows]) for index, title in enumerate(titles)]
 
 
 def _describe(card: Mapping[str, object]) -> str:

@@ -84,7 +84,7 @@ def print_summary(summary: SummaryTable, heading: str = "", compared: Group | No
 
 def as_text(summary: SummaryTable) -> str:
     """Return the tables as plain text."""
-    console = Console(width=ROOMY, file=io.StringIO(), record=True)
+    console = Console(width=ROOMY, file=io.StringIO(), record=True, force_jupyter=False)
     console.print(summary)
     return console.export_text()
 

@@ -28,6 +28,7 @@ from wiw.runs.compose import Experiment, RunContext, compose, make_for_space, re
 from wiw.runs.limits import Limits
 from wiw.runs.part_options import parse_options
 from wiw.runs.sources import source_digests
+from wiw.suggestions import did_you_mean
 from wiw.tasks.base import Task
 from wiw.types import PRIMITIVES
 from wiw.world_models.base import WorldModel, find_accepts
@@ -60,6 +61,13 @@ class TaskRecipe:
         from wiw.registry import TASKS
 
         return cast(Task, TASKS.make(self.name, **self.options))
+
+    def with_default_seed(self) -> TaskRecipe:
+        """Return the task with seed 0 where its options have none, if it takes a seed."""
+        from wiw.registry import TASKS
+
+        is_open = "seed" not in self.options and _takes_option(TASKS.find(self.name), "seed")
+        return replace(self, options={**self.options, "seed": 0}) if is_open else self
 
     def find_policy(self) -> str:
         """Return the policy that runs the task where nobody names one: the preset's, or else the task's.
@@ -336,6 +344,12 @@ class AgentRecipe(AgentConfig):
 _FIELDS = tuple(field.name for field in fields(AgentRecipe) if field.name != "observers")
 
 
+def _takes_option(found: Any, name: str) -> bool:
+    """Return whether a class or factory takes an argument of a name; something that is already made takes none."""
+    parameters = inspect.signature(found).parameters if callable(found) else {}
+    return name in parameters or any(one.kind is one.VAR_KEYWORD for one in parameters.values())
+
+
 def _replay(options: Mapping[str, Any], run: Path) -> dict[str, Any]:
     """Return a policy's options with a run's recorded answers in place of all models, those of its roles included."""
     replayed = {**options, "vlm": f"replay:{run}", "cache": "off"}
@@ -548,13 +562,29 @@ def require_semantics_use(agents: Mapping[str, AgentRecipe | AgentInMemory]) -> 
     """Check that a source of semantics has a world model to label views for.
 
     Raises:
-        ArgumentError: semantics are named, and no arm has a world model.
+        ArgumentError: semantics are named, and no arm has a world model, or every arm's is known to need no labels.
     """
     recipes = [recipe for recipe in agents.values() if isinstance(recipe, AgentRecipe) and recipe.semantics is not None]
     if recipes and all(recipe.model is None for recipe in recipes):
         raise ArgumentError(
             "semantics: labels are for a world model, but no arm has one: give --world-model or leave semantics out"
         )
+    if recipes and not any(map(_may_need_labels, recipes)):
+        models = ", ".join(dict.fromkeys(str(recipe.model) for recipe in recipes if recipe.model is not None))
+        raise ArgumentError(
+            f"semantics: labels are for a world model that needs them, but no arm has one: {models} would not look at "
+            "them; give one that does, such as pathdreamer, or leave semantics out"
+        )
+
+
+def _may_need_labels(agent: AgentRecipe) -> bool:
+    """Return whether an agent's world model may need semantic labels: one that is not built in may say so once made."""
+    if agent.model is None or agent.model in REFERENCES:
+        return False
+    if not isinstance(agent.model, str) or agent.model not in WORLD_MODELS.built_in:
+        return True
+    declared = find_accepts(WORLD_MODELS.find(agent.model))
+    return declared is None or "semantic" in declared.needs
 
 
 def _change_model(agent: AgentRecipe, text: str) -> AgentRecipe:
@@ -596,9 +626,19 @@ def _split_repeat(model: str) -> tuple[bool, str | None]:
 
 
 def _split_policy(name: str) -> tuple[str | None, str]:
-    """Return policy (None: the agent's own) and world model of "oracle" or "heuristic+oracle"."""
+    """Return policy (None: the agent's own) and world model of "oracle" or "heuristic+oracle".
+
+    Raises:
+        ArgumentError: a known world model is preceded by a name that is no policy's.
+    """
     policy, plus, model = name.partition("+")
-    return (policy, model) if plus and policy in POLICIES.names() else (None, name)
+    if plus and policy in POLICIES.names():
+        return policy, model
+    if plus and not {":", "/"} & {*policy} and model in WORLD_MODELS.names():
+        known = POLICIES.names()
+        hint = did_you_mean(policy, known)
+        raise ArgumentError(f"arms: '{name}': no policy is named '{policy}'.{hint} Known: {', '.join(known)}")
+    return None, name
 
 
 def _name_arm(policy: str | None, model: str, repeats: bool) -> str:

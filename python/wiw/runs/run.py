@@ -5,6 +5,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
 from dataclasses import fields
+from html import escape
 from pathlib import Path
 from typing import Any
 
@@ -14,9 +15,14 @@ from wiw.runs.store import RunStore
 from wiw.runs.store_file import FILE_NAME, store_path
 from wiw.types import TableSpec
 
+SHOWN = 20
+"""Records that a notebook shows, and beyond which they are not printed in full."""
+LONGEST, LONGEST_CELL = 5000, 60
+"""Characters of records that are printed in full, and of a cell in a notebook."""
+
 
 class Records(list[dict[str, Any]]):
-    """A list of plain dicts that turns into a pandas DataFrame on request."""
+    """A list of plain dicts that turns into a pandas DataFrame on request; prints in full only if it is short."""
 
     def to_pandas(self) -> Any:
         """Return the records as a DataFrame, nested metrics as columns.
@@ -30,10 +36,30 @@ class Records(list[dict[str, Any]]):
             raise ArgumentError("to_pandas needs pandas, which is not installed: pip install pandas") from None
         return pandas.DataFrame([_flat(record) for record in self])
 
+    def __repr__(self) -> str:
+        text = super().__repr__() if len(self) <= SHOWN else ""
+        return text if 0 < len(text) <= LONGEST else f"Records({self._count()}; .to_pandas() for a DataFrame)"
+
+    def _repr_html_(self) -> str:
+        rows = [_flat(record) for record in self[:SHOWN]]
+        names = list(dict.fromkeys(name for row in rows for name in row))
+        lines = [_html_row("th", names), *(_html_row("td", [row.get(name, "") for name in names]) for row in rows)]
+        count = self._count() if len(self) <= SHOWN else f"The first {SHOWN} of {self._count()}"
+        return f"<table>{''.join(lines)}</table><p>{count}; .to_pandas() for a DataFrame</p>"
+
+    def _count(self) -> str:
+        return "1 record" if len(self) == 1 else f"{len(self)} records"
+
 
 def _flat(record: dict[str, Any]) -> dict[str, Any]:
     metrics = record.get("metrics", {})
     return {**{name: value for name, value in record.items() if name != "metrics"}, **metrics}
+
+
+def _html_row(tag: str, values: Sequence[Any]) -> str:
+    texts = (str(value) for value in values)
+    short = (text if len(text) <= LONGEST_CELL else f"{text[: LONGEST_CELL - 1]}…" for text in texts)
+    return f"<tr>{''.join(f'<{tag}>{escape(text)}</{tag}>' for text in short)}</tr>"
 
 
 class Run:
@@ -84,6 +110,11 @@ class Run:
     def __repr__(self) -> str:
         ended = {arm: sum(record["arm"] == arm for record in self.episodes) for arm in self.arms}
         return f"{type(self).__name__}({str(self.path)!r}, ended: {ended} of {len(self.store.episodes())})"
+
+
+def find_folder(run: str | Path | Run) -> Path:
+    """Return the folder of a run that is given as such or as an object."""
+    return run.path if isinstance(run, Run) else Path(run)
 
 
 def find_stores(runs: Sequence[str | Path]) -> list[Path]:

@@ -11,7 +11,7 @@ from pathlib import Path
 from typing import Any, Literal
 
 from wiw.runs.processes import is_here, is_running
-from wiw.runs.run import find_shards, find_stores
+from wiw.runs.run import Run, find_folder, find_shards, find_stores
 from wiw.runs.shards import Shard
 from wiw.runs.store import RunStore
 
@@ -104,17 +104,18 @@ class RunStatus:
         return "\n".join(line.rstrip() for line in lines)
 
 
-def status(run: str | Path) -> RunStatus:
+def status(run: str | Path | Run) -> RunStatus:
     """Return the progress of a run.
 
     Args:
-        run: folder of a run, or one that contains the folders of its shards. These are shown even
+        run: a run, its folder, or one that contains the folders of its shards. These are shown even
             where the run was merged from them, for they may have gone on.
 
     Raises:
         StoreError: no store, or one that cannot be read.
     """
-    return RunStatus(Path(run), tuple(map(_read_status, find_shards(run) or find_stores([run]))))
+    folder = find_folder(run)
+    return RunStatus(folder, tuple(map(_read_status, find_shards(folder) or find_stores([folder]))))
 
 
 def _read_status(folder: Path) -> StoreStatus:

@@ -20,6 +20,7 @@ from wiw.errors import ArgumentError, StoreError
 from wiw.runs.execute import read_recipes, require_own_sources, require_scenes
 from wiw.runs.limits import Limits
 from wiw.runs.rows import AgentRow, DecisionRow, LostRow, OutcomeRow, RestartRow, to_json
+from wiw.runs.run import Run, find_folder
 from wiw.runs.store import DECISION_JSON, RunStore
 from wiw.runs.workers import Job, Runner, WorkerSpec
 
@@ -74,11 +75,11 @@ Facts = list[tuple[str, dict[str, Any]]]
 """(place, values) of an episode in order: "agent", "decision 0", ..., "outcome"."""
 
 
-def verify(run: str | Path, episodes: int = 3, seed: int = 0) -> Verification:
+def verify(run: str | Path | Run, episodes: int = 3, seed: int = 0) -> Verification:
     """Rerun `episodes` random episodes of a run, in every arm that has finished them, and compare.
 
     Args:
-        run: the run's folder.
+        run: a run, or its folder.
         episodes: how many; all if the run has fewer.
         seed: seed of the sample of episodes.
 
@@ -90,7 +91,7 @@ def verify(run: str | Path, episodes: int = 3, seed: int = 0) -> Verification:
     """
     if episodes < 1:
         raise ArgumentError(f"verify: expected episodes of at least 1, got {episodes}")
-    with RunStore.read(run) as store:
+    with RunStore.read(find_folder(run)) as store:
         store.require_benchmark()
         ended = {(row["arm"], row["episode"]): row for row in store.recorded_outcomes() if row["status"] == "done"}
         if not ended:

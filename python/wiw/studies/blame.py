@@ -21,6 +21,7 @@ from wiw.registry import WORLD_MODELS
 from wiw.runs.execute import read_recipes, require_own_sources, require_scenes, run_pending
 from wiw.runs.platform import describe_platform
 from wiw.runs.recipes import AgentRecipe
+from wiw.runs.run import Run, find_folder
 from wiw.runs.store import RunStore
 
 _ORDER = 0x626C616D
@@ -28,7 +29,7 @@ _ORDER = 0x626C616D
 
 
 def blame(
-    run: str | Path,
+    run: str | Path | Run,
     arms: str | Sequence[str] | None = None,
     episodes: int | None = None,
     workers: int | None = None,
@@ -52,7 +53,7 @@ def blame(
     where the first one stopped, and runs nothing twice.
 
     Args:
-        run: the run's folder.
+        run: a run, or its folder.
         arms: one, several, or None for all.
         episodes: maximum number of failures per arm, sampled at random; a larger number includes the failures of a
             smaller one. None means all.
@@ -75,7 +76,7 @@ def blame(
     for name, value in (("episodes", episodes), ("workers", workers)):
         if value is not None and value < 1:
             raise ArgumentError(f"blame: expected {name} of at least 1, got {value}")
-    with RunStore.read(run) as base:
+    with RunStore.read(find_folder(run)) as base:
         wanted = _choose_failures(base, arms, episodes)
         task, agents = _make_recipes(base, wanted)
         store = _open_store(base, agents)

@@ -29,6 +29,7 @@ from wiw.errors import ArgumentError, StoreError
 from wiw.loop.config import AgentConfig
 from wiw.report.tables import SummaryTable
 from wiw.runs.rows import drop_folders, to_json
+from wiw.runs.run import find_folder
 from wiw.studies.run_log import RunLog, load_run
 from wiw.types import Episode
 
@@ -159,7 +160,7 @@ def _open(run: str | Path | RunLog, judge: str | None, stack: ExitStack) -> RunL
     """Return a run with the marks of a judge; what is opened for it is closed with the stack."""
     if isinstance(run, RunLog) and judge is None:
         return run
-    return stack.enter_context(closing(load_run(run.path if isinstance(run, RunLog) else run, judge)))
+    return stack.enter_context(closing(load_run(find_folder(run), judge)))
 
 
 def _summarise_arms(log: RunLog, both: Summary, labels: Mapping[str, str]) -> list[ArmSummary]:

@@ -21,6 +21,7 @@ from wiw.registry import TASKS, task_class
 from wiw.runs.judges import JUDGE_ERROR, JudgedRow, JudgeRecord, can_be_judged
 from wiw.runs.progress import AnswerProgress, make_board
 from wiw.runs.rows import to_json
+from wiw.runs.run import find_folder
 from wiw.runs.store import RunStore
 from wiw.studies.run_log import RunLog, load_run
 from wiw.tasks.answer_record import AnswerRecord, read_judgements
@@ -76,7 +77,7 @@ def judge(
         wiw.load_run("runs/first", judge="rules+llm").summary()  # later, the same
 
     Args:
-        run: the run's folder.
+        run: a run, or its folder.
         judge: see `wiw.judging.make_judge`.
         progress: whether to show a bar.
         options: options of a language model as judge, such as temperature, seed, prompts, timeout; see
@@ -87,7 +88,7 @@ def judge(
         StoreError: the run cannot be read, is being written, or its task has no answers in words.
         VlmError: the model's name was not given, and its server cannot be asked for it.
     """
-    folder = run.path if isinstance(run, RunLog) else Path(run)
+    folder = find_folder(run)
     made = make_judge(judge, **options)
     with RunStore.annotate(folder) as store:
         marking = _JudgingPass(store, made)

@@ -15,6 +15,7 @@ from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass, field
 from functools import cached_property
+from html import escape
 from pathlib import Path
 from typing import Any
 
@@ -86,6 +87,14 @@ class Quality:
         from wiw.report.quality_tables import print_quality
 
         print_quality(self.table)
+
+    def __str__(self) -> str:
+        from wiw.report.quality_tables import as_text
+
+        return as_text(self.table)
+
+    def _repr_html_(self) -> str:
+        return f"<pre>{escape(str(self))}</pre>"
 
     def to_json(self) -> str:
         """Return the numbers as JSON."""

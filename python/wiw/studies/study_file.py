@@ -42,6 +42,8 @@ from wiw.suggestions import did_you_mean
 from wiw.typed_values import read_values, require_known
 
 FOLDER = Path(__file__).parents[1] / "configs" / "studies"
+FUNCTIONS = {"errors": "wiw.study_errors(out, settings)", "data-scaling": "wiw.data_scaling(data, out)"}
+"""Studies that are no files but functions, by their names on the command line."""
 PLOTS = ("success", "rollouts", "quality")
 """Figures of a run: success by arm; against imagined futures; against quality and controllability."""
 _KEYS = ("title", "about", "text", "variables", "small", "settings", "runs")
@@ -99,11 +101,13 @@ def find_study(study: str | Path) -> Path:
     """Return the file of a study, by name or path.
 
     Raises:
-        ArgumentError: no shipped study has that name, and it is no YAML file.
+        ArgumentError: no shipped study has that name, and it is no YAML file; or it is a function of its own.
     """
     path = Path(study).expanduser()
     if path.suffix in (".yaml", ".yml"):
         return path
+    if call := FUNCTIONS.get(str(study)):
+        raise ArgumentError(f"study: '{study}' is a function of its own: call {call} instead")
     known = list_studies()
     if str(study) not in known:
         raise ArgumentError(
@@ -215,7 +219,8 @@ def _read_quality(options: Any, plots: Sequence[str], where: str) -> Mapping[str
 
 def _give_seed(task: TaskRecipe, settings: Mapping[str, Any]) -> TaskRecipe:
     """Return the task with its episodes from the run's seed, as on the command line."""
-    return TaskRecipe(task.name, {"seed": settings.get("seed", 0), **task.options})
+    seed = {} if settings.get("seed") is None else {"seed": settings["seed"]}
+    return TaskRecipe(task.name, {**seed, **task.options}).with_default_seed()
 
 
 def _read_arms(arms: Any, agent: Any, where: str) -> dict[str, AgentRecipe]:

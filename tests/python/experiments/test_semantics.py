@@ -27,7 +27,7 @@ from wiw.loop.privileged import LiveEnvironments
 from wiw.perception.semantics import CATEGORIES, OTHER_CATEGORY, Semantics
 from wiw.policies.base import FrameSpec
 from wiw.runs.compose import RunContext
-from wiw.runs.recipes import AgentRecipe
+from wiw.runs.recipes import AgentRecipe, arm_recipes, require_semantics_use
 from wiw.tasks.imagenav import ImageNav
 from wiw.types import Conditioning, Key, Proposal
 
@@ -265,6 +265,16 @@ def test_semantics_need_a_world_model(two_rooms: str, tmp_path: Path, capfd: pyt
     begin = ["run", "imagenav", "--scenes", two_rooms, "--episodes", "1", "--semantics", "simulator", "--arms", "none"]
     assert main([*begin, "--out", str(tmp_path / "run")]) == 2
     assert "no arm has one" in capfd.readouterr().err and not (tmp_path / "run").exists()
+
+
+def test_semantics_need_a_world_model_that_may_look_at_them(reader: str) -> None:
+    def require(*arms: str) -> None:
+        require_semantics_use(arm_recipes(AgentRecipe("matcher", semantics="simulator"), arms))
+
+    with pytest.raises(ArgumentError, match="warp, copy would not look at them; give one that does"):
+        require("none", "warp", "copy")
+    for model in ("pathdreamer", reader, "remote:ws://host:80", "warp,x=pathdreamer"):
+        require("none", *model.split(","))
 
 
 def test_an_arm_without_a_model_loads_no_network(tmp_path: Path) -> None:

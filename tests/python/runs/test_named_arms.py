@@ -134,6 +134,12 @@ def test_two_checkpoints_of_one_model_are_two_arms_of_a_run(shade, two_rooms, tm
         wiw.evaluate("imagenav", AgentRecipe("heuristic"), 1, scenes=two_rooms, arms=["a=copy?speed=3"], out="wrong")
 
 
+def test_a_policy_that_is_misspelt_is_told_from_a_world_model():
+    with pytest.raises(ArgumentError, match=r"no policy is named 'matchr'\. Did you mean matcher\?"):
+        arm_recipes(AgentRecipe("heuristic"), ["none", "matchr+warp"])
+    assert arm_recipes(AgentRecipe("heuristic"), ["a+b/mine.py:Mine"])["Mine"].policy == "heuristic"
+
+
 def test_arms_in_one_text_are_those_of_the_command_line():
     text = "none,copy,small=warp?size=[144, 256]"
     assert arm_recipes(AgentRecipe("matcher"), text) == arm_recipes(AgentRecipe("matcher"), split_arms(text))

@@ -49,6 +49,8 @@ def test_shards_episodes_errors_and_shards_without_a_store(tmp_path, capsys):
     begin(tmp_path / "run/1", shard="1/3", scenes="broken")
     begin(tmp_path / "run/3", shard="3/3", scenes="broken", arms=["none"])
     found = wiw.status(tmp_path / "run")
+    with closing(load_run(tmp_path / "run/1")) as log:
+        assert wiw.status(log) == wiw.status(tmp_path / "run/1")
     assert [(str(s.shard), s.ended, s.total, s.errors, s.state) for s in found.stores] == [
         ("1/3", 2, 2, 1, "done"),
         ("3/3", 2, 2, 0, "done"),

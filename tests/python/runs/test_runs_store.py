@@ -22,6 +22,7 @@ from wiw.runs import store as store_module
 from wiw.runs.judges import JudgedRow, JudgeRecord
 from wiw.runs.recipes import AgentRecipe
 from wiw.runs.rows import OutcomeRow, decision_row, decode_jpeg, encode_jpeg, outcome_row, strip, to_json
+from wiw.runs.run import Records
 from wiw.runs.store import SCHEMA_VERSION, RunStore
 from wiw.studies.run_log import load_run
 from wiw.types import Decision, DecisionRecord, EpisodeResult, Goal, Observation, Proposal, Rollout, Truth
@@ -361,6 +362,22 @@ def test_records_become_data_frames(run):
     assert list(log.decisions.to_pandas()["arm"]) == ["warp"]
     assert log.table()[1]["success"] == 100.0 and log.table()[1]["n"] == 1
     assert not log.complete and "warp" in repr(log)
+
+
+def test_tables_as_text_are_not_shown_besides_in_a_notebook(run, monkeypatch):
+    monkeypatch.setattr("rich.console._is_jupyter", lambda: True)
+    monkeypatch.setattr("rich.jupyter.display", lambda *shown: pytest.fail("shown besides"))
+    assert "warp" in str(load_run(run.path.parent).numbers())
+
+
+def test_many_records_print_in_a_line_and_few_in_full():
+    few = Records([{"arm": "<a>", "metrics": {"success": 1.0}}])
+    assert repr(few) == str(list(few)) and repr(Records()) == "[]"
+    assert "<td>&lt;a&gt;</td><td>1.0</td>" in few._repr_html_() and "<p>1 record;" in few._repr_html_()
+    many = Records([{"index": index, "plans": "x" * 1000} for index in range(720)])
+    assert repr(many) == "Records(720 records; .to_pandas() for a DataFrame)"
+    assert repr(Records(many[:9])) == "Records(9 records; .to_pandas() for a DataFrame)"
+    assert "The first 20 of 720 records" in many._repr_html_() and len(many._repr_html_()) < 3000
 
 
 def test_json_is_standard_and_refuses_what_it_cannot_hold():

@@ -39,6 +39,7 @@ def change(run, statement, *values):
 def test_a_run_comes_out_again_as_it_was_recorded(run, capsys):
     before = store_path(run).read_bytes()
     found = wiw.verify(run, episodes=3)
+    assert wiw.verify(wiw.load_run(run), episodes=3) == found
     assert found.same and len({check.episode for check in found.checks}) == 3
     assert len({check.recorded for check in found.checks}) == 3 and all(
         len(check.recorded) == 64 for check in found.checks

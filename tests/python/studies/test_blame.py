@@ -186,7 +186,7 @@ def test_some_episodes_then_more_and_nothing_twice(run: Path, blamed: Any) -> No
     some, before = found["spinner"], again(run)
     assert (len(some.episodes), some.remaining) == (1, EPISODES - 1)
     assert f"{EPISODES - 1} of {EPISODES} failures have not been rerun" in found.notes()[0]
-    whole = wiw.blame(run, "spinner", progress=False)["spinner"]
+    whole = wiw.blame(wiw.load_run(run), "spinner", progress=False)["spinner"]
     assert {one.episode for one in some.episodes} < {one.episode for one in whole.episodes}
     assert whole == blamed["spinner"] and before.items() <= again(run).items()
 

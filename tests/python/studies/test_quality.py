@@ -517,6 +517,7 @@ def test_the_command_line_writes_tables_and_figures(
 ) -> None:
     assert main(["quality", str(run), "--frames", "12", "--out", str(tmp_path)]) == 0
     said = capsys.readouterr().out
+    assert str(wiw.quality(run, frames=12, out=tmp_path)) == said[: said.index(str(tmp_path))]
     assert "Rank correlation with SR over arms" in said and "3 arms prove little" in said and "SSIM" in said
     assert {file.name for file in tmp_path.iterdir()} == {f"quality.{form}" for form in ("html", "svg", "png", "json")}
     assert cv2.imread(str(tmp_path / "quality.png")).shape[1] > 1000

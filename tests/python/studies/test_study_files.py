@@ -229,6 +229,9 @@ def test_studies_are_listed_taught_and_looked_up(capsys: Any, tmp_path: Path) ->
     assert main(["study", "vlm", "--set", "server"]) == 2 and "expected NAME=VALUE" in capsys.readouterr().err
     with pytest.raises(FileError, match=r"nowhere.yaml does not exist; expected a study"):
         load_study(tmp_path / "nowhere.yaml")
+    for name, call in (("errors", r"wiw\.study_errors"), ("data-scaling", r"wiw\.data_scaling")):
+        with pytest.raises(ArgumentError, match=f"'{name}' is a function of its own: call {call}"):
+            wiw.study(name)
 
 
 def test_shipped_studies_are_what_they_say() -> None:

@@ -19,7 +19,7 @@ from wiw.datasets import episodes as episode_file
 from wiw.errors import ArgumentError, FileError, RegistryError
 from wiw.metrics import path_efficiency
 from wiw.registry import TASKS
-from wiw.runs.recipes import task_recipe
+from wiw.runs.recipes import AgentRecipe, task_recipe
 from wiw.scenes import resolve
 from wiw.tasks.imagenav import ImageNav
 from wiw.tasks.manipulation import Manipulation
@@ -153,6 +153,20 @@ def test_the_example_of_a_world_of_ones_own_runs(tmp_path: Path, capsys: pytest.
     assert (tmp_path / "run/report.html").exists()
     with pytest.raises(SystemExit):
         main(["run", task, "--nonsense"])
+
+
+def test_a_task_without_a_seed_runs_and_is_refused_with_one(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    own = "class Own(Corridor):\n    def __init__(self, budget: int = 12):\n        super().__init__(5, budget)\n"
+    (tmp_path / "own.py").write_text(f"{(EXAMPLES / 'corridor.py').read_text()}\n\n{own}")
+    task, agent = f"{tmp_path / 'own.py'}:Own", AgentRecipe("heuristic")
+    flags = ["--policy", "heuristic", "--episodes", "1", "--no-report", "--out", str(tmp_path / "run")]
+    assert main(["run", task, *flags]) == 0
+    log = wiw.evaluate(task, agent, 1, out=tmp_path / "python", progress=False)
+    assert wiw.load_run(tmp_path / "run").store.config == log.store.config and log.store.config["seed"] == 5
+    assert main(["run", task, *flags, "--seed", "3", "--resume"]) == 2
+    assert "unexpected keyword argument 'seed'; it takes (budget" in capsys.readouterr().err
+    with pytest.raises(RegistryError, match="unexpected keyword argument 'seed'"):
+        wiw.evaluate(task, agent, 1, seed=3, out=tmp_path / "seeded", progress=False)
 
 
 def test_the_example_of_a_variant_runs_under_the_presets_of_what_it_derives_from(two_rooms: str) -> None:
