@@ -322,7 +322,7 @@ class WorldModel(ABC):
     requires: ClassVar[Requirements] = Requirements()
     credits: float | None = None
     """Credits that a paid service has charged so far; None if imagining is free."""
-    __signature__ = _Signature()
+    __signature__: ClassVar[Any] = _Signature()
 
     def __init_subclass__(cls, **kwargs: Any) -> None:
         super().__init_subclass__(**kwargs)
