@@ -3,6 +3,7 @@
 
 from __future__ import annotations
 
+import inspect
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import asdict, replace
 from pathlib import Path
@@ -63,7 +64,8 @@ class NavigationTask(NavigationSpec, Task):
         **rules: Any,
     ) -> None:
         own, generator = presets.rule_names(self.rules_class), presets.rule_names(self.generator_class)
-        require_known(rules, [*own, *generator], f"options of {self.name}", "rule")
+        named = [name for name in inspect.signature(NavigationTask).parameters if name != "rules"]
+        require_known(rules, [*named, *own, *generator], self.name, "option")
         self.overridden = {name: value for name, value in rules.items() if name in own}
         """Rules that were given as options."""
         owner = presets.find_owner(type(self))

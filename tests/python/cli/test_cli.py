@@ -238,7 +238,7 @@ def test_a_task_takes_options(tmp_path, two_rooms, short, capsys):
     assert main(["resume", str(tmp_path / "run"), "--no-report"]) == 0
     for wrong, message in (
         ("radius=wide", "radius: expected a number"),
-        ("radios=9", "unknown rule 'radios'"),
+        ("radios=9", "unknown option 'radios'"),
         ("seed=3", "--seed"),
         ("radius", "KEY=VALUE"),
     ):

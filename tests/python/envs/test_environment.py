@@ -160,7 +160,7 @@ def test_using_it_before_reset_says_so(env) -> None:
     for use in (env.truth, env.instances):
         with pytest.raises(ArgumentError, match="reset"):
             use()
-    with pytest.raises(ArgumentError, match="unknown rule"):
+    with pytest.raises(ArgumentError, match="unknown option"):
         wiw.make("ImageNav-v0", raduis=1.0)
 
 

@@ -146,7 +146,7 @@ def test_what_does_not_apply_is_refused(flags: list[str], said: str, tmp_path: P
 
 def test_other_tasks_have_no_tasks(capsys: Any) -> None:
     assert main(["run", "imagenav", "--tasks", "push_buttons", "--policy", "heuristic"]) == 2
-    assert "unknown rule 'tasks'" in capsys.readouterr().err
+    assert "unknown option 'tasks'" in capsys.readouterr().err
     assert main(["episodes", "manipulation"]) == 2
     assert "determined by the seed" in capsys.readouterr().err
 

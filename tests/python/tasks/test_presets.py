@@ -108,7 +108,7 @@ def test_a_preset_that_is_not_there_is_named(tmp_path: Path) -> None:
         ImageNav(preset="offical")
     with pytest.raises(FileError, match=r"none\.yaml"):
         ImageNav(preset=tmp_path / "none.yaml")
-    with pytest.raises(ArgumentError, match="options of imagenav: unknown rule 'speed'"):
+    with pytest.raises(ArgumentError, match="imagenav: unknown option 'speed'"):
         ImageNav(speed=3)
 
 

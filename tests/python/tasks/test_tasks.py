@@ -301,7 +301,7 @@ def test_a_misspelt_scene_spec_has_a_hint(spec: str, meant: str) -> None:
 def test_other_misspelt_names_have_one_too(two_rooms: str) -> None:
     with pytest.raises(FileError, match=r"Did you mean two_rooms\.obj"):
         resolve(str(Path(two_rooms).with_name("two_room.obj")))
-    with pytest.raises(ArgumentError, match=r"unknown rule 'goal_instance'; .*Did you mean goal_instances or"):
+    with pytest.raises(ArgumentError, match=r"unknown option 'goal_instance'; .*Did you mean goal_instances or"):
         ImageNav(goal_instance=1)
     with pytest.raises(ArgumentError, match=r"Did you mean decisions\?"):
         ImageNav(decison=3)
