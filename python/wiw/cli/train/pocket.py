@@ -40,11 +40,11 @@ def train_pocket(
     $ wiw train pocket --data data --option clips=1600 --out short.safetensors
     $ wiw run imagenav --world-model pocket --world-model-option weights=pocket.safetensors
 
-    Training takes two to three hours on two idle cores, minutes on a GPU, less with --option clips=N. Repeat an
-    interrupted command to resume it; finished weights are never replaced. SIGUSR1 writes the checkpoint at once. FILE
-    also holds the recipe, PSNR on windows of the val scenes, next to baselines without learning, and how much of it is
-    lost when given another window's places. The weights shipped with wiw were trained on one epoch of 34,932 clips, on
-    a GPU.
+    Training takes two hours on two idle cores (more beside other programs), minutes on a GPU, less with --option
+    clips=N. Repeat an interrupted command to resume it; finished weights are never replaced. SIGUSR1 writes the
+    checkpoint at once. FILE also holds the recipe, PSNR on windows of the val scenes, next to baselines without
+    learning, and how much of it is lost when given another window's places. The weights shipped with wiw were trained
+    on one epoch of 34,932 clips, on a CPU.
 
     Args:
         data: Dataset of `wiw collect navigation`.
