@@ -93,7 +93,7 @@ def demo(*, out: Annotated[Path | None, arg(metavar="DIR")] = None) -> int:
     $ wiw demo
 
     Args:
-        out: Folder for the runs, one per task. Default: runs/demo-TIME.
+        out: Folder for the runs, one per task. Default: runs/demo-TIME-XXXX.
     """
     from wiw.runs.config import name_folder
 

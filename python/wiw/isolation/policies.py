@@ -22,7 +22,7 @@ from wiw.errors import ContractError, RegistryError
 from wiw.isolation.child import Host
 from wiw.isolation.source import Isolated, Source, build_signature, describe_class, read_file_version
 from wiw.json_text import parse_json
-from wiw.policies.base import FrameSpec, Policy, Situation
+from wiw.policies.base import FrameSpec, Policy, Situation, check_revision
 from wiw.registry import POLICIES
 from wiw.types import Answer, Decision, Exchange, Goal, Key, Proposal, Rollout, TextAnswer
 from wiw.wire.arrays import pack_array, unpack_array
@@ -141,7 +141,7 @@ class IsolatedPolicy(Isolated, Policy):
     ) -> tuple[NDArray[Any], int | None]:
         """Return the policy's decision."""
         actions, chosen = self._call(revise, _hide_memories([situation])[0], proposals, scores)
-        return _read_array("revise", actions), None if chosen is None else int(chosen)
+        return _read_array("revise", actions), chosen
 
     def answer(
         self,
@@ -315,8 +315,9 @@ def score(host: Host, situations: Sequence[Situation], proposals: Any, rollouts:
 
 def revise(host: Host, situation: Situation, proposals: Any, scores: Any) -> Any:
     """Return the plan that the policy decides on, and its number."""
-    actions, chosen = host.made.revise(_show_memories(host, [situation])[0], proposals, scores)
-    return _pack_values(actions), None if chosen is None else int(chosen)
+    revision = host.made.revise(_show_memories(host, [situation])[0], proposals, scores)
+    actions, chosen = check_revision(host.made, revision, len(proposals))
+    return _pack_values(actions), chosen
 
 
 def answer(host: Host, situations: Sequence[Situation], proposals: Any, rollouts: Any) -> Any:

@@ -142,25 +142,6 @@ def check_scores(policy: Policy, scores: Any, proposals: Sequence[Sequence[Propo
     return found
 
 
-def check_revision(policy: Policy, revision: Any, count: int) -> tuple[Any, int | None]:
-    """Return what `revise` has decided: a plan, and its number among `count` proposals or None for a new one.
-
-    Raises:
-        ContractError: it is no such pair, there is no such proposal, or its number is no whole one.
-    """
-    name = f"{type(policy.unwrapped).__name__}.revise"
-    if not isinstance(revision, Sequence) or len(revision) != 2:
-        raise ContractError(f"{name}: expected (actions, number of the proposal, or None), got {revision!r}")
-    actions, chosen = revision
-    if chosen is None:
-        return actions, None
-    if isinstance(chosen, bool) or not isinstance(chosen, int | np.integer) or not 0 <= chosen < count:
-        raise ContractError(
-            f"{name}: expected the number of one of {count} proposals, from 0, or None for a new plan, got {chosen!r}"
-        )
-    return actions, int(chosen)
-
-
 def check_answerer(policy: Policy, goal: Goal) -> None:
     """Refuse a reviser that gives no answer where the goal requires one.
 

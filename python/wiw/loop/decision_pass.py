@@ -17,7 +17,6 @@ from wiw.loop.contract import (
     check_observations,
     check_pictures,
     check_proposals,
-    check_revision,
     check_scores,
 )
 from wiw.loop.imagination import Imagination, Imaginer, ModelInput, NoImagination, Request
@@ -27,7 +26,7 @@ from wiw.loop.observers import Observer, ScoringBatch
 from wiw.loop.plan_space import PlanSpace
 from wiw.loop.privileged import LiveEnvironments, Privileged
 from wiw.loop.search import Search
-from wiw.policies.base import FrameSpec, Policy
+from wiw.policies.base import FrameSpec, Policy, check_revision
 from wiw.types import Answer, Decision, Proposal, TextAnswer
 
 

@@ -21,7 +21,7 @@ from wiw.types import check_seed
 
 
 def name_folder(kind: str) -> Path:
-    """Return a new run's folder: what is run, the time, and four digits, for runs may begin in the same second."""
+    """Return a new run's folder: what is run, when, and random digits, for runs may begin in the same second."""
     return Path("runs") / f"{kind}-{datetime.now():%Y%m%d-%H%M%S}-{secrets.token_hex(2)}"
 
 
@@ -62,7 +62,7 @@ class RunConfig(Limits, EngineConfig):
     episode it is. Default: random, and kept in the store. Give the same one to all shards, and to runs that are to
     share their random draws. Empty: keys are seed and index."""
     out: Annotated[Path | str | None, arg(metavar="DIR")] = None
-    """Folder of the run. Default: runs/TASK-TIME."""
+    """Folder of the run. Default: runs/TASK-TIME-XXXX."""
     workers: Annotated[int, arg(metavar="N")] = 1
     """Number of processes; results do not depend on it. More than one requires a task and agent that are given by name
     or can be pickled."""

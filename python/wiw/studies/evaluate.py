@@ -125,7 +125,7 @@ def _hint_at_settings(options: Iterable[str]) -> Iterator[None]:
         if not any(hints):
             raise
         end, hint = "" if str(error).endswith((".", "?")) else ".", next(filter(None, hints)).removesuffix("?")
-        raise ArgumentError(f"{error}{end}{hint}, of the run's settings?") from None
+        raise ArgumentError(f"{error}{end} As a setting of the run:{hint}?") from None
 
 
 def resume_run(
@@ -335,9 +335,9 @@ def _list_episodes(task: Any, count: int) -> list[Episode]:
     """
     found = list(task.episodes(count))
     if len(found) != count or not all(isinstance(each, Episode) for each in found):
-        kinds = ", ".join(sorted({type(each).__name__ for each in found})) or "none"
+        kinds = "".join(f", {kind}" for kind in sorted({type(each).__name__ for each in found}))
         name = f"{type(task).__name__}.episodes"
-        raise ContractError(f"{name}: expected {count} of wiw.types.Episode, got {len(found)}: {kinds}")
+        raise ContractError(f"{name}: expected {count} episodes (wiw.types.Episode), got {len(found)}{kinds}")
     return found
 
 

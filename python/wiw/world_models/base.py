@@ -307,7 +307,8 @@ class _Signature:
     """What the class of a model takes: nothing where it has no constructor, though `__new__` would take anything."""
 
     def __get__(self, instance: Any, owner: type[Any]) -> inspect.Signature | None:
-        return inspect.Signature() if owner.__init__ is object.__init__ else None
+        is_plain = owner.__init__ is object.__init__ and owner.__new__ is WorldModel.__new__
+        return inspect.Signature() if is_plain else None
 
 
 class WorldModel(ABC):

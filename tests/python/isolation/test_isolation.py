@@ -366,6 +366,23 @@ def test_a_policy_decides_in_its_process_as_in_ours_and_cannot_take_the_run_with
         wiw.policy("isolated:matcher")
 
 
+def test_a_revision_is_held_to_its_contract_in_its_process_too(tmp_path) -> None:
+    task = TaskRecipe(f"{PYTHON_TESTS / 'fakes.py'}:line_task")
+    for number, (revision, said) in enumerate(
+        {
+            "proposals[0]": "expected .actions, number of the proposal, or None., got Proposal",
+            "(proposals[0].actions, 0.9)": "expected the number of one of .* got 0.9",
+        }.items()
+    ):
+        file = tmp_path / f"vague{number}.py"
+        file.write_text(f"{POLICY}\n    def revise(self, situation, proposals, scores):\n        return {revision}\n")
+        for isolated in ("", "isolated:"):
+            with pytest.raises(ContractError, match=rf"Own\.revise: {said}"):
+                evaluate(
+                    task, AgentRecipe(f"{isolated}{file}:Own"), 1, out=tmp_path / f"{isolated}{number}", progress=False
+                )
+
+
 def test_a_policy_s_new_process_takes_no_memory_for_one_of_the_old_one_s(tmp_path) -> None:
     (tmp_path / "own.py").write_text(POLICY)
     policy, key, goal = wiw.policy(f"isolated:{tmp_path / 'own.py'}:Own"), Key(0, 0), Goal("imagenav")

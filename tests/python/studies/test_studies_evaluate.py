@@ -213,7 +213,7 @@ def test_numbers_of_numpy_are_numbers(tmp_path):
 def test_a_misspelt_setting_is_told_from_an_option_of_the_task(misspelt, meant):
     for task in ("imagenav", LineTask()):
         with pytest.raises(
-            ArgumentError, match=rf"'?{misspelt}'?.*\w[.?] Did you mean {meant}.*, of the run's settings\?$"
+            ArgumentError, match=rf"'?{misspelt}'?.*\w[.?] As a setting of the run: Did you mean {meant}.*\?$"
         ):
             evaluate(task, LineAgent(), **{misspelt: 1})
     with pytest.raises(ArgumentError) as error:
@@ -540,8 +540,8 @@ def test_a_task_is_held_to_its_contract(tmp_path):
             return None if self._is_placeless else super().environment(depth)
 
     for task, said in (
-        (Careless([]), r"Careless\.episodes: expected 8 of wiw\.types\.Episode, got 0: none"),
-        (Careless([1] * 8), "expected 8 .*got 8: int"),
+        (Careless([]), r"Careless\.episodes: expected 8 episodes \(wiw\.types\.Episode\), got 0$"),
+        (Careless([1] * 8), "expected 8 .*got 8, int"),
         (Careless(None, is_placeless=True), r"Careless\.environment: expected a wiw\.Env, got None"),
     ):
         with pytest.raises(ContractError, match=said):
