@@ -72,8 +72,8 @@ def replies_without_a_plan() -> Iterator[str]:
         json.dumps(value)
         for value in (
             {"reason": "r"},
-            {"Actions": ACTIONS, "reason": "r"},
-            {"actions": ACTIONS, "Reason": "r"},
+            {"ACTIONS": ACTIONS, "reason": "r", "Actions": ["forward"]},
+            {"actions": ACTIONS, "reason": "r", "Reason": "s"},
             {"actions": ACTIONS, "reason": "r", "Actions": ["forward"]},
             {"actions": ["forward left"], "reason": "r"},
         )
@@ -125,7 +125,9 @@ def held(text: str, finish: str = "stop") -> None:
         return
     ((actions, reason),) = parse_plans(reply.value)
     assert 1 <= len(actions) <= 5 and isinstance(reason, str)
-    rest = text[text.index("actions") :] if text.index("actions") > text.find("reason") else text
+    found = {name: re.search(name, text, re.IGNORECASE) for name in ("actions", "reason")}
+    begin, other = (-1 if each is None else each.start() for each in found.values())
+    rest = text[begin:] if begin > other else text
     rest = re.sub(r"[\s_-]+", "_", rest.casefold())
     for name in reply.value.actions:
         rest = rest[rest.index(name) + len(name) :]
@@ -149,13 +151,14 @@ def test_no_plan_is_made_out_of_an_answer_that_holds_none() -> None:
         {"reason": "r", "actions": ACTIONS, "confidence": 1},
         {"reason": "r", "actions": ["Forward", "Turn Left", "TURN-RIGHT", " forward "]},
         {"thoughts": ["a", "wall"], "actions": ["forward", "turn  left", "Turn_Right", "FORWARD"]},
+        {"Reason": "r", "Actions": ACTIONS},
     ],
 )
 def test_harmless_variations_are_read_and_recorded(said: dict[str, Any]) -> None:
     for text in (json.dumps(said), f"Here it is: {json.dumps(said)}"):
         reply = plan_of(text)
         assert reply.problem is None and reply.adapted and not reply.repaired
-        assert reply.value.actions == ACTIONS and reply.value.reason == said.get("reason", "")
+        assert reply.value.actions == ACTIONS and reply.value.reason == said.get("reason", said.get("Reason", ""))
     listed = plan_of(json.dumps({"plans": [said], "number": 1}), count=2)
     assert [plan.actions for plan in listed.value.plans] == [ACTIONS]
     assert plan_of(GOOD).problem is None and not plan_of(GOOD).adapted
