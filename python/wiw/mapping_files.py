@@ -43,13 +43,15 @@ def parse_yaml(text: str) -> Any:
     """Return the value of a YAML text.
 
     Raises:
-        ValueError: its lists and mappings are nested too deeply.
+        ValueError: its lists and mappings are nested too deeply, or a value is none, such as the date 2026-13-40.
         yaml.YAMLError: it is no YAML.
     """
     try:
         return deepcopy(_parse_yaml_once(text))
     except RecursionError:
         raise ValueError(TOO_DEEP) from None
+    except OverflowError as error:  # PyYAML makes characters of any number
+        raise ValueError(f"expected characters of Unicode, got another: {error}") from None
 
 
 @lru_cache(maxsize=64)  # every task reads its presets anew, and parsing takes longer than all else that makes a task

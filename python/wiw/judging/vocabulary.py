@@ -15,6 +15,7 @@ import yaml
 
 from wiw.errors import FileError
 from wiw.judging.words import split_words
+from wiw.mapping_files import parse_yaml
 
 FILE = Path(__file__).parent / "vocabulary.yaml"
 Kind = Literal["object", "room", "color", "material", "state"]
@@ -67,7 +68,7 @@ class Vocabulary:
     def __init__(self, file: Path = FILE) -> None:
         try:
             source = file.read_bytes()
-            entries: dict[Kind, dict[str, dict[str, Any]]] = yaml.safe_load(source)
+            entries: dict[Kind, dict[str, dict[str, Any]]] = parse_yaml(source.decode("utf-8"))
         except (OSError, ValueError, yaml.YAMLError) as error:
             raise FileError(f"{file}: expected a vocabulary in YAML: {error}") from error
         self.digest = blake2b(source, digest_size=8).hexdigest()

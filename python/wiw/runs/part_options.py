@@ -10,6 +10,7 @@ from pathlib import Path
 from typing import Any
 
 from wiw.errors import ArgumentError
+from wiw.mapping_files import parse_yaml
 
 FILES = ("weights", "checkpoint", "vae")
 """Options that are files or folders although they are annotated as text, since they may be names on a hub too."""
@@ -45,8 +46,8 @@ def parse_options(pairs: Sequence[str], factory: Callable[..., Any], flag: str) 
         path = _make_absolute(value) if names_files else None
         try:
             is_text = annotation.startswith("str") and not (value == "null" and "None" in annotation)
-            options[name] = path or (value if is_text else yaml.safe_load(value))
-        except yaml.YAMLError as error:
+            options[name] = path or (value if is_text else parse_yaml(value))
+        except (ValueError, yaml.YAMLError) as error:
             raise ArgumentError(f"{flag}: {pair}: the value is not valid YAML ({error})") from None
     return options
 

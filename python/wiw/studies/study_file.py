@@ -34,7 +34,7 @@ from typing import Any
 import yaml
 
 from wiw.errors import ArgumentError
-from wiw.mapping_files import read_yaml_mapping
+from wiw.mapping_files import parse_yaml, read_yaml_mapping
 from wiw.runs.arm_text import check_arm_name, split_arms
 from wiw.runs.config import RunConfig
 from wiw.runs.recipes import AgentRecipe, TaskRecipe, absolute, arm_recipes, require_reference
@@ -129,8 +129,8 @@ def parse_variables(pairs: Sequence[str]) -> dict[str, Any]:
         if not equals or not name.strip() or name.strip() in found:
             raise ArgumentError(f"study: --set: expected NAME=VALUE, each name once, got '{pair}'")
         try:
-            found[name.strip()] = yaml.safe_load(value)
-        except yaml.YAMLError as error:
+            found[name.strip()] = parse_yaml(value)
+        except (ValueError, yaml.YAMLError) as error:
             raise ArgumentError(f"study: --set: {pair}: the value is not valid YAML ({error})") from None
     return found
 

@@ -198,7 +198,13 @@ def test_a_world_model_takes_options(tmp_path, two_rooms, short, capsys):
     given = {"weights": "123", "strength": 0.25}
     assert taken == {"none": {}, "placebo-shuffled": given, "Tinted": given}
     assert main(["resume", str(tmp_path / "run"), "--no-report"]) == 0
-    for wrong, said in (("weights", "KEY=VALUE"), ("speed=3", "unexpected keyword"), ("strength=[", "not valid YAML")):
+    for wrong, said in (
+        ("weights", "KEY=VALUE"),
+        ("speed=3", "unexpected keyword"),
+        ("strength=[", "not valid YAML"),
+        ("strength=2026-13-40", "not valid YAML"),
+        (r'strength="\Ud80088888888"', "not valid YAML"),
+    ):
         assert main([*task, *model, "--world-model-option", wrong, "--out", str(tmp_path / "again")]) == 2
         assert said in capsys.readouterr().err
         assert not (tmp_path / "again").exists()  # so that the same folder may be named once it is put right

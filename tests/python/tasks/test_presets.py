@@ -94,6 +94,8 @@ def test_a_file_of_ones_own_starts_from_a_shipped_preset(tmp_path: Path) -> None
         ("base: mine", ArgumentError, "base 'mine' is not one of default, paper, foresight, official"),
         ("- 1\n- 2", FileError, "expected rules as `name: value` lines, got list"),
         ("a: [", FileError, "own.yaml"),
+        (r'a: "\Ud80088888888888888"', FileError, "expected characters of Unicode"),
+        ("a: 2026-13-40", FileError, "own.yaml.*month"),
     ],
 )
 def test_what_is_wrong_in_a_file_is_named(tmp_path: Path, text: str, error: type, message: str) -> None:
