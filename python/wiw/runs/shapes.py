@@ -5,6 +5,7 @@ nothing is written that could not be read again.
 
 from __future__ import annotations
 
+import sys
 from collections.abc import Mapping, Sequence
 from typing import Any
 
@@ -13,6 +14,7 @@ from wiw.json_text import parse_json
 
 EDITED = "the run store was edited: restore it from a backup"
 """Ends messages about values that no version of wiw writes."""
+MOST = sys.float_info.max
 NUMBER = (int, float, type(None))
 """A number, or null for one that is not finite."""
 TEXT, FLAG = (str,), (bool,)
@@ -181,6 +183,8 @@ def _check(value: Any, shape: Any, place: str) -> None:
     elif isinstance(shape, tuple):
         if not isinstance(value, shape) or (isinstance(value, bool) and bool not in shape):
             raise ValueError(f"{place or 'value'}: expected {_list_names(shape)}, got {type(value).__name__}")
+        if isinstance(value, int | float) and not -MOST <= value <= MOST:
+            raise ValueError(f"{place or 'value'}: expected a finite number, got {str(value)[:20]}")
     elif isinstance(shape, list):
         _require(value, list, place)
         for index, item in enumerate(value):

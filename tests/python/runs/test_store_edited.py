@@ -97,6 +97,13 @@ def test_an_edited_number_is_named(whole: Path, tmp_path: Path, table: str, colu
         read_all(run, report=True)
 
 
+@pytest.mark.parametrize(("number", "said"), [("1e999", "inf"), ("NaN", "nan"), ("9" * 400, "9")])
+def test_a_number_that_is_not_finite_is_named(whole: Path, tmp_path: Path, number: str, said: str) -> None:
+    run = edit_store(whole, tmp_path / "run", "outcome", "metrics", f'{{"success": 1, "decisions": {number}}}')
+    with pytest.raises(StoreError, match=f"metrics: decisions: expected a finite number, got {said}"):
+        read_all(run, report=True)
+
+
 @pytest.mark.parametrize("name", ["task", "seed", "episodes", "arms"])
 def test_a_config_that_lacks_something_is_named(whole: Path, tmp_path: Path, name: str) -> None:
     run = tmp_path / "run"
