@@ -79,9 +79,10 @@ def require_known(names: Iterable[Any], known: Collection[str], where: str, noun
     """
     unknown = [str(name) for name in names if name not in known]
     if unknown:
-        there = ", ".join(known) or "none"
-        hint = did_you_mean(unknown[0], list(known))
-        raise ArgumentError(f"{where}: unknown {noun} '{unknown[0]}'; expected one of {there}.{hint}")
+        there = [str(name) for name in known]  # YAML reads 1 as a number, as a name too
+        hint = did_you_mean(unknown[0], there)
+        expected = ", ".join(there) or "none"
+        raise ArgumentError(f"{where}: unknown {noun} '{unknown[0]}'; expected one of {expected}.{hint}")
 
 
 def _read_value(value: Any, kind: Any, where: str) -> Any:

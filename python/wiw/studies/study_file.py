@@ -171,6 +171,8 @@ def _fill_variables(content: Mapping[str, Any], given: Mapping[str, Any], small:
     """Return the value of each variable: given, else the small one if asked for, else the file's own."""
     own = _require_mapping(content.get("variables") or {}, f"{where}: variables")
     less = _require_mapping(content.get("small") or {}, f"{where}: small")
+    for name in own:
+        _require_text(name, f"{where}: variables")
     require_known(less, own, f"{where}: small")
     require_known(given, own, "study: --set")
     return {**own, **(less if small else {}), **given}

@@ -139,6 +139,9 @@ def test_a_pair_of_arms_named_by_text_says_which_is_unknown(tmp_path: Path) -> N
     ("old", "new", "said"),
     [
         ("title:", "titel:", "unknown name 'titel'.*Did you mean title"),
+        ("small: {episodes", "small: {1: 2, episodes", "small: unknown name '1'"),
+        ("variables: {", "variables: {off: 3, ", "variables: expected a name, got one that YAML reads as False"),
+        (", model: warp,", ", 1: warp,", "unknown name 'model'; expected one of scenes, 1, episodes"),
         (
             '"{model}", reviser',
             '"{modle}", reviser',
