@@ -307,9 +307,16 @@ def draw_in_blocks(seed: int, end: int, rows: int, columns: int) -> Iterator[NDA
 
     They are those of a single draw, which may take too much memory.
     """
-    rng, most = np.random.Generator(np.random.Philox(key=seed)), max(1, BLOCK // columns)
+    rng = np.random.Generator(np.random.Philox(key=seed))
+    for count in split_rows(rows, columns):
+        yield rng.integers(end, size=(count, columns))
+
+
+def split_rows(rows: int, columns: int) -> Iterator[int]:
+    """Yield how many of so many rows to draw at a time: no more than `BLOCK` numbers, but at least a row."""
+    most = max(1, BLOCK // columns)
     for begin in range(0, rows, most):
-        yield rng.integers(end, size=(min(most, rows - begin), columns))
+        yield min(most, rows - begin)
 
 
 def sum_by_cluster(values: Array, clusters: NDArray[np.generic]) -> tuple[Array, Array]:

@@ -11,7 +11,7 @@ from itertools import permutations
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from wiw.analysis.intervals import BLOCK, Interval
+from wiw.analysis.intervals import Interval, split_rows
 from wiw.errors import ArgumentError
 
 LEAST = 3
@@ -159,9 +159,8 @@ def _bootstrap(means: tuple[_Sums, _Sums], skip: bool, seed: int) -> tuple[float
 
 def _draw_weights(clusters: int, seed: int) -> Iterator[NDArray[np.float64]]:
     """Yield how often each draw has each cluster, float64 [RESAMPLES, clusters] in all, a block of draws at a time."""
-    rng, most = np.random.Generator(np.random.Philox(key=seed)), max(1, BLOCK // clusters)
-    for begin in range(0, RESAMPLES, most):
-        count = min(most, RESAMPLES - begin)
+    rng = np.random.Generator(np.random.Philox(key=seed))
+    for count in split_rows(RESAMPLES, clusters):
         yield rng.multinomial(clusters, np.full(clusters, 1 / clusters), count).astype(np.float64)
 
 

@@ -3,7 +3,6 @@
 
 from __future__ import annotations
 
-import io
 import math
 from collections.abc import Mapping, Sequence
 
@@ -14,7 +13,7 @@ from wiw.analysis.quality import CONTROL, PAPER_QUALITY, QualityTable
 from wiw.analysis.rank_correlation import Correlation
 from wiw.analysis.statistics import Estimate
 from wiw.analysis.summary import show_estimate, show_p
-from wiw.report.tables import ROOMY, Column, show_count, stack_tables
+from wiw.report.tables import ROOMY, Column, make_text_console, show_count, stack_tables
 
 ABOUT = {
     "SSIM": "Controllability: structural similarity of imagined and true frames, 1 for equal ones.",
@@ -74,7 +73,7 @@ def print_quality(table: QualityTable) -> None:
 
 def as_text(table: QualityTable) -> str:
     """Return what `print_quality` prints as plain text."""
-    console = Console(width=ROOMY, file=io.StringIO(), record=True, force_jupyter=False)
+    console = make_text_console()
     _print_to(console, table)
     return console.export_text()
 

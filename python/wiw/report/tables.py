@@ -84,9 +84,14 @@ def print_summary(summary: SummaryTable, heading: str = "", compared: Group | No
 
 def as_text(summary: SummaryTable) -> str:
     """Return the tables as plain text."""
-    console = Console(width=ROOMY, file=io.StringIO(), record=True, force_jupyter=False)
+    console = make_text_console()
     console.print(summary)
     return console.export_text()
+
+
+def make_text_console() -> Console:
+    """Return a console that shows nothing and keeps what is printed, for `export_text`."""
+    return Console(width=ROOMY, file=io.StringIO(), record=True, force_jupyter=False)
 
 
 def print_costs(run: Run) -> None:

@@ -32,7 +32,7 @@ class ARRules:
     horizon: int
     """L, primitives per plan."""
     execute: Literal["primitive", "sequence"]
-    """What is carried out of the chosen plan before the next decision: its first primitive, or its first L, which are
+    """Part of the chosen plan carried out before the next decision: its first primitive, or its first L, which are
     all of it unless a search of several levels has extended it."""
     confidence: float
     """An answer more probable than this, before it is normalised (`Answer.confidence`), ends the episode at once."""

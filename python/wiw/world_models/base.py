@@ -304,7 +304,7 @@ def find_accepts(model: Any) -> Accepts | None:
 
 
 class _Signature:
-    """What the class of a model takes: nothing where it has no constructor, though `__new__` would take anything."""
+    """Arguments of a model's class: none where it has no constructor, though `__new__` would take anything."""
 
     def __get__(self, instance: Any, owner: type[Any]) -> inspect.Signature | None:
         is_plain = owner.__init__ is object.__init__ and owner.__new__ is WorldModel.__new__

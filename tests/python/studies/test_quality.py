@@ -23,7 +23,7 @@ from locations import ROOT
 from scipy import stats
 
 import wiw
-from wiw.analysis import rank_correlation
+from wiw.analysis import intervals, rank_correlation
 from wiw.analysis.quality import Sample, add_paper_quality, summarise_quality
 from wiw.analysis.rank_correlation import correlate, permutation_p, spearman
 from wiw.cli import main
@@ -165,7 +165,7 @@ def test_many_scenes_take_little_memory_and_blocks_are_the_draws_of_one(monkeypa
     success, values, scenes = rng.random((4, 5000)), rng.random((4, 5000)), np.arange(5000)
     monkeypatch.setattr(rank_correlation, "RESAMPLES", 50)
     whole = correlate("m", success, values, scenes)
-    monkeypatch.setattr(rank_correlation, "BLOCK", 7 * 5000)
+    monkeypatch.setattr(intervals, "BLOCK", 7 * 5000)
     tracemalloc.start()
     assert correlate("m", success, values, scenes) == whole
     peak = tracemalloc.get_traced_memory()[1]
