@@ -10,6 +10,7 @@ from pathlib import Path
 from typing import Any
 
 from wiw.errors import ArgumentError, StoreError
+from wiw.metrics.metric import name_column
 from wiw.registry import TASKS, task_class
 from wiw.runs.store import RunStore
 from wiw.runs.store_file import FILE_NAME, store_path
@@ -25,7 +26,7 @@ class Records(list[dict[str, Any]]):
     """A list of plain dicts that turns into a pandas DataFrame on request; prints in full only if it is short."""
 
     def to_pandas(self) -> Any:
-        """Return the records as a DataFrame, nested metrics as columns.
+        """Return the records as a DataFrame, nested metrics as columns (`name_column` names them).
 
         Raises:
             ArgumentError: pandas is not installed.
@@ -52,7 +53,7 @@ class Records(list[dict[str, Any]]):
 
 
 def _flat(record: dict[str, Any]) -> dict[str, Any]:
-    metrics = record.get("metrics", {})
+    metrics = {name_column(name, record): value for name, value in record.get("metrics", {}).items()}
     return {**{name: value for name, value in record.items() if name != "metrics"}, **metrics}
 
 

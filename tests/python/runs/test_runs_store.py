@@ -362,6 +362,8 @@ def test_records_become_data_frames(run):
     assert list(log.decisions.to_pandas()["arm"]) == ["warp"]
     assert log.table()[1]["success"] == 100.0 and log.table()[1]["n"] == 1
     assert not log.complete and "warp" in repr(log)
+    (row,) = Records([{"steps": 3, "metrics": {"steps": 0.5, "success": 1.0}}]).to_pandas().to_dict("records")
+    assert row == {"steps": 3, "metric_steps": 0.5, "success": 1.0}
 
 
 def test_tables_as_text_are_not_shown_besides_in_a_notebook(run, monkeypatch):
