@@ -15,7 +15,7 @@
 #include "wiw/scene/import.hpp"
 #include "wiw/scene/import/collada_check.hpp"
 #include "wiw/scene/import/file.hpp"
-#include "wiw/scene/import/obj_check.hpp"
+#include "wiw/scene/import/guarded_io.hpp"
 #include "wiw/scene/import/ply_header.hpp"
 
 namespace wiw::physics {
@@ -48,11 +48,14 @@ class MeshFile {
     if (code) throw error("no such file");
     if (bytes > kMaxBytes) throw error("larger than 256 MiB, which a mesh of a link has no need of");
     check_damage();
+    // NOLINTNEXTLINE(*-owning-memory): the importer owns it
+    importer_.SetIOHandler(new scene::GuardedIo(options_, extension_of(path_) == ".obj"));
     importer_.SetPropertyBool(AI_CONFIG_IMPORT_COLLADA_IGNORE_UP_DIRECTION, true);  // URDF knows the file's axes only
     importer_.SetPropertyInteger(AI_CONFIG_PP_SBP_REMOVE, aiPrimitiveType_LINE | aiPrimitiveType_POINT);
     importer_.SetPropertyInteger(AI_CONFIG_PP_RVC_FLAGS, aiComponent_NORMALS);
     importer_.SetPropertyFloat(AI_CONFIG_PP_GSN_MAX_SMOOTHING_ANGLE, kSmooth);
     const aiScene* scene = importer_.ReadFile(path_.string(), 0);
+    if (scene == nullptr) name_link([&] { scene::rethrow_own_error(importer_); });
     if (scene == nullptr) throw error(importer_.GetErrorString());
     for (unsigned m = 0; m < scene->mNumMeshes; ++m) check_faces(*scene->mMeshes[m]);
     scene = importer_.ApplyPostProcessing(aiProcess_ValidateDataStructure);
@@ -90,7 +93,6 @@ class MeshFile {
     name_link([&] {
       if (extension_of(path_) == ".ply") scene::check_ply(path_);
       if (extension_of(path_) == ".dae") scene::check_collada(path_);
-      if (extension_of(path_) == ".obj") scene::check_obj(path_);
     });
   }
 
@@ -119,6 +121,7 @@ class MeshFile {
 
   const fs::path path_;
   const std::string link_;
+  const scene::ImportOptions options_{.limits = {.file_bytes = kMaxBytes}};  // the importer reads by it
   Assimp::Importer importer_;
 };
 

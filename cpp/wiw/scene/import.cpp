@@ -17,7 +17,6 @@
 #include "wiw/scene/import/file.hpp"
 #include "wiw/scene/import/gltf_scene.hpp"
 #include "wiw/scene/import/guarded_io.hpp"
-#include "wiw/scene/import/obj_check.hpp"
 #include "wiw/scene/import/ply_header.hpp"
 #include "wiw/scene/text.hpp"
 
@@ -45,12 +44,15 @@ void check_indices(const aiScene& file, const std::filesystem::path& path) {
   }
 }
 
-const aiScene& parse(Assimp::Importer& importer, const std::filesystem::path& path, const ImportOptions& options) {
+const aiScene& parse(Assimp::Importer& importer, const FileContext& context) {
+  const std::filesystem::path& path = context.path;
   // The file's axes are turned by UpAxis alone, so that one rule holds for every format.
   importer.SetPropertyBool(AI_CONFIG_IMPORT_COLLADA_IGNORE_UP_DIRECTION, true);
   importer.SetPropertyBool(AI_CONFIG_IMPORT_COLLADA_USE_COLLADA_NAMES, true);
-  importer.SetIOHandler(new GuardedIo(options));  // NOLINT(*-owning-memory): the importer owns it
+  // NOLINTNEXTLINE(*-owning-memory): the importer owns it
+  importer.SetIOHandler(new GuardedIo(context.options, context.format == MeshFormat::kObj));
   const aiScene* file = importer.ReadFile(path.string(), 0);
+  if (!file) rethrow_own_error(importer);
   if (!file) throw FileError(path.string(), "cannot be read: " + std::string(importer.GetErrorString()));
   if ((file->mFlags & AI_SCENE_FLAGS_INCOMPLETE) || !file->mRootNode) {
     throw FileError(path.string(), "holds no complete scene");
@@ -65,13 +67,12 @@ const aiScene& parse(Assimp::Importer& importer, const std::filesystem::path& pa
 void check_content(const FileContext& context) {
   if (context.format == MeshFormat::kPly) check_ply(context.path);
   if (context.format == MeshFormat::kDae) check_collada(context.path);
-  if (context.format == MeshFormat::kObj) check_obj(context.path);
 }
 
 void convert_with_assimp(const FileContext& context, const UpAxis& up, Scene& scene) {
   check_content(context);
   const auto importer = make_importer();
-  const aiScene& file = parse(*importer, context.path, context.options);
+  const aiScene& file = parse(*importer, context);
   convert_materials(file, context, scene);
   convert_nodes(file, context, up, scene);
 }

@@ -144,6 +144,53 @@ def test_a_texture_named_in_latin_1_is_found_by_its_name_in_utf_8(tmp_path: Path
     assert plain(mesh).texture_count == 1
 
 
+@pytest.mark.parametrize(
+    ("obj", "mtl", "words"),
+    [
+        (OBJ, b"#\fmap_Kd a\n", "m.mtl: line 2 has 'map_Kd'"),
+        (OBJ, b"#\0map_Kd a\n", "m.mtl: line 2 has 'map_Kd'"),
+        (OBJ, b"#\r\n# two\r\nmap_Kd a\r\n", "m.mtl: line 3 has 'map_Kd'"),
+        (OBJ, b"# one\n \tmap_Kd a\n", "m.mtl: line 2 has 'map_Kd'"),
+        (OBJ, b"\xef\xbb\xbfmap_Kd a\n", "m.mtl: line 1 has 'map_Kd'"),
+        (OBJ, "\ufeffmap_Kd a\n".encode("utf-16-be"), "m.mtl: is text in UTF-16"),
+        (OBJ, "\ufeffmap_Kd a\n".encode("utf-16-le"), "m.mtl: is text in UTF-16"),
+        (b"#\r" + OBJ, b"map_Kd a\n", "m.mtl: line 1 has 'map_Kd'"),
+        (b"#\f" + OBJ, b"map_Kd a\n", "m.mtl: line 1 has 'map_Kd'"),
+        (OBJ.replace(b"mtllib ", b"mtllib \\\n"), b"map_Kd a\n", "m.mtl: line 1 has 'map_Kd'"),
+        (b"mtllib m.obj\rmap_Kd a\n" + OBJ, MTL, "m.obj: line 1 has 'mtllib'"),
+    ],
+)
+def test_a_texture_of_no_material_is_found_however_lines_end(
+    tmp_path: Path, obj: bytes, mtl: bytes, words: str
+) -> None:
+    """Assimp, which follows it into nowhere, ends lines at more than line feeds, and knows the marks of Unicode."""
+    write(tmp_path / "m.mtl", mtl)
+    path = str(write(tmp_path / "m.obj", obj))
+    code = f"""
+from wiw import scenes
+from wiw.errors import FileError
+try:
+    scenes.load({path!r}, cache=False, isolate=False)
+except FileError as error:
+    print(error)
+"""
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=False)
+    assert done.returncode == 0, done.stderr
+    assert words in done.stdout
+
+
+@pytest.mark.parametrize(
+    ("old", "new"),
+    [(b"\n", b"\r\n"), (b"\n", b"\r"), (b"1 2 3\n", b"1 \\\n2 \\\r\n3\n"), (b"1 2 3\n", b"1 2 3\nv 1 \\"), (b"", b"")],
+)
+def test_an_obj_is_the_same_however_lines_end_and_go_on(tmp_path: Path, old: bytes, new: bytes) -> None:
+    write(tmp_path / "part.png", png())
+    write(tmp_path / "m.mtl", b"\xef\xbb\xbf" + MTL.replace(b"\n", new if old == b"\n" else b"\n"))
+    scene = plain(write(tmp_path / "m.obj", b"\xef\xbb\xbf" + OBJ.replace(old, new) if old else OBJ))
+    assert scene.triangle_count == 1 and not scene.warnings
+    assert [entry["name"] for entry in scene.instances] == ["part"]
+
+
 def test_an_error_that_quotes_bytes_of_a_file_is_an_error_of_the_file(tmp_path: Path) -> None:
     for isolate in (False, True):
         mesh = write(tmp_path / "m.ply", PLY.replace(b"property float y", LATIN + b" float y"))

@@ -4,9 +4,12 @@
 #include <algorithm>
 #include <assimp/IOStream.hpp>
 #include <cstring>
+#include <exception>
 #include <stdexcept>
 
+#include "wiw/core/error.hpp"
 #include "wiw/scene/import/file.hpp"
+#include "wiw/scene/import/obj_text.hpp"
 
 namespace wiw::scene {
 namespace {
@@ -59,11 +62,35 @@ Assimp::IOStream* GuardedIo::Open(const char* file, const char* mode) {
   if (std::string_view(mode).find_first_of("wa+") != std::string_view::npos || !Exists(file)) return nullptr;
   if (options_.trace) options_.trace->read.emplace_back(file);
   check_limit(file, "bytes", size_of_file(file), options_.limits.file_bytes, "file_bytes");
-  return new GuardedStream(read_file(file));  // NOLINT(cppcoreguidelines-owning-memory): assimp closes it
+  auto bytes = is_obj_ ? read_obj(file) : read_file(file);
+  ++open_;
+  return new GuardedStream(std::move(bytes));  // NOLINT(cppcoreguidelines-owning-memory): assimp closes it
+}
+
+std::vector<std::uint8_t> GuardedIo::read_obj(const char* file) const {
+  auto bytes = read_file(file);
+  unify_line_ends(file, bytes);
+  if (open_ == 0) {
+    join_continued_lines(bytes);
+  } else {  // what is read while the OBJ is read are its materials, be it the same file
+    check_obj_materials(file, bytes);
+  }
+  return bytes;
 }
 
 void GuardedIo::Close(Assimp::IOStream* stream) {
+  --open_;
   delete stream;  // NOLINT(cppcoreguidelines-owning-memory): made by Open
+}
+
+void rethrow_own_error(const Assimp::Importer& importer) {
+  if (!importer.GetException()) return;
+  try {
+    std::rethrow_exception(importer.GetException());
+  } catch (const Error&) {
+    throw;
+  } catch (...) {  // assimp's own, whose text it tells
+  }
 }
 
 }  // namespace wiw::scene
