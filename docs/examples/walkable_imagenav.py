@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""A variant of an existing task: Image-Goal Navigation that succeeds only if the agent itself stops at the goal."""
+"""A variant of an existing task: Image-Goal Navigation in which a goal behind a wall does not count as reached."""
 
 from __future__ import annotations
 
@@ -7,10 +7,10 @@ from wiw.envs.episode_state import EpisodeState
 from wiw.tasks.imagenav import ImageNav
 
 
-class PatientImageNav(ImageNav):
-    """Succeeds if the agent stops within the goal's radius."""
+class WalkableImageNav(ImageNav):
+    """Succeeds if the agent comes within the goal's radius, and the way from there is at most twice as long."""
 
-    name = "patient-imagenav"
+    name = "walkable-imagenav"
 
     def is_success(self, state: EpisodeState) -> bool:
-        return state.stopped and state.distance_to_goal() <= self.rules.radius
+        return super().is_success(state) and (state.success or state.geodesic_to_goal() <= 2 * self.rules.radius)

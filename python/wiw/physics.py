@@ -10,10 +10,10 @@ segments each, one inside the other, run at 7000 steps per second; of 12 segment
 
     world = World()
     world.add_body(Box([1, 1, 0.1]), T_world_body=place(z=-0.05))      # a table, static
-    cube = world.add_body(Box([0.04] * 3), mass=0.1, T_world_body=place(x=0.5, z=0.02))
+    cube = world.add_body(Box([0.04] * 3), mass=0.1, T_world_body=place(x=0.4, z=0.02))
     arm = world.add_articulation(panda())
     world.set_joint_positions(PANDA_READY)
-    path = world.plan_linear(place(x=0.5, z=0.02, rpy=(np.pi, 0, 0)), PANDA_TCP)
+    path = world.plan_linear(place(x=0.4, z=0.02, rpy=(np.pi, 0, 0)), PANDA_TCP)
     if path.reason == "free" and world.follow(path):
         Gripper(world).close()                                         # the index of the body it holds, or None
 """

@@ -448,8 +448,6 @@ def make(task_id: str, depth: bool = True, **options: Any) -> Any:
         ArgumentError: something else than a name.
         RegistryError: unknown task, or options that do not fit; the message lists the known ones.
     """
-    if options.pop("render_mode", None) not in (None, "rgb_array"):
-        raise ArgumentError("render_mode: expected 'rgb_array'; environments draw into arrays alone")
     task, own = _make_task(task_id, options)
     return task.environment(depth=depth, **own)
 
@@ -459,14 +457,21 @@ def make_vec(task_id: str, num_envs: int, depth: bool = True, **options: Any) ->
 
     Raises:
         RegistryError: unknown task, or options that do not fit; the message lists the known ones.
-        ArgumentError: `num_envs` below 1.
+        ArgumentError: something else than a name; `num_envs` below 1.
     """
     task, own = _make_task(task_id, options)
     return task.vector_environment(num_envs, depth=depth, **own)
 
 
 def _make_task(task_id: str, options: dict[str, Any]) -> tuple[Any, dict[str, Any]]:
-    """Return the task, and the options that belong to its environments."""
+    """Return the task, and the options that belong to its environments.
+
+    Raises:
+        ArgumentError: see `make`.
+        RegistryError: see `make`.
+    """
+    if options.pop("render_mode", None) not in (None, "rgb_array"):
+        raise ArgumentError("render_mode: expected 'rgb_array'; environments draw into arrays alone")
     name = task_name(task_id)
     sensors = task_class(name).sensor_options
     task = TASKS.make(name, **{key: value for key, value in options.items() if key not in sensors})

@@ -10,10 +10,10 @@ from dataclasses import replace
 import numpy as np
 
 import wiw
-from wiw._core import core
 from wiw.action import FORWARD, TURN_LEFT
+from wiw.loop.imagine import seed_of
 from wiw.tasks.imagenav import ImageNav
-from wiw.types import Proposal
+from wiw.types import Key, Proposal
 from wiw.world_models.oracle import Oracle
 
 
@@ -33,7 +33,7 @@ class LiveEnvironmentFinder(wiw.WorldModel):
 def invert_seeds(seeds, run_seed, episodes=50, decisions=20, candidates=8):
     """Return (episode, decision, candidate) for each seed that is made of the run's seed and small numbers."""
     known = {
-        int(core.fold_key([run_seed, episode, decision, candidate])): (episode, decision, candidate)
+        seed_of(Key(run_seed, episode, decision), candidate): (episode, decision, candidate)
         for episode in range(episodes)
         for decision in range(decisions)
         for candidate in range(candidates)

@@ -216,6 +216,21 @@ class EpisodeState:
         return self.decisions >= task.decisions if self.decisions else self.actions >= task.budget
 
 
+def answer_in_words(task: NavigationSpec, goal: Goal, state: EpisodeState, text: str) -> None:
+    """End an episode with an answer in words.
+
+    Raises:
+        ArgumentError: the goal is not a question, the text is empty, or the episode has been ended before.
+    """
+    if not goal.question or not text.strip():
+        raise ArgumentError(f"answer: expected a text in reply to a question, got {text!r} in task {task.name}")
+    if state.ended:  # an episode whose budget is used up may still be answered
+        raise ArgumentError(
+            "answer: the episode has ended; reset(), or in a vector environment the next step, starts another"
+        )
+    state.record_answer(task, TextAnswer(text, 1.0, final=True), final=True)
+
+
 def draw_episode(task: NavigationSpec, random: np.random.Generator) -> int:
     """Return a random episode's number."""
     return int(random.integers(task.drawn_count))

@@ -14,6 +14,7 @@ from wiw.envs.base import Env, Segment, read_episode_number
 from wiw.envs.episode_state import (
     EpisodeState,
     NavigationSpec,
+    answer_in_words,
     draw_episode,
     observe_place,
     start_episode,
@@ -142,13 +143,7 @@ class NavigationEnv(gymnasium.Env[dict[str, Any], int], Env):
         Raises:
             ArgumentError: the goal is not a question, the text is empty, or the episode has been ended before.
         """
-        if not self.goal.question or not text.strip():
-            raise ArgumentError(
-                f"answer: expected a text in reply to a question, got {text!r} in task {self.task.name}"
-            )
-        if self.state.ended:  # an episode whose budget is used up may still be answered
-            raise ArgumentError("answer: the episode has ended; call reset() to start another")
-        self.state.record_answer(self.task, TextAnswer(text, 1.0, final=True), final=True)
+        answer_in_words(self.task, self.goal, self.state, text)
         return self.result()
 
     def _carry_out(self, actions: Sequence[int] | NDArray[np.int8]) -> Segment:

@@ -34,6 +34,6 @@ class TableGuide(Guide):
         return found
 
     def suggest_plan(self, length: int) -> NDArray[np.float64]:
-        """Return the expert's next poses, float64 [K, 7], 1 <= K <= length; the present pose where nothing helps."""
+        """Return the expert's next poses, float64 [K, 7], 1 <= K <= length; `idle_action` where nothing helps."""
         plan = self.task.plan_expert(self.table, self.bench)[:length]
-        return plan if len(plan) else self.bench.pose[None]
+        return plan if len(plan) else self.bench.idle_action[None]

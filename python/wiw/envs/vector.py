@@ -17,6 +17,7 @@ from wiw.envs.base import read_episode_numbers
 from wiw.envs.episode_state import (
     EpisodeState,
     NavigationSpec,
+    answer_in_words,
     draw_episode,
     image_names,
     make_observation,
@@ -120,6 +121,17 @@ class VectorEnv(gymnasium.vector.VectorEnv[dict[str, Any], NDArray[np.int64], ND
                 self._add_info(infos, {"result": self.result(int(place))}, int(place))
         self._over = terminated | truncated
         return observation, rewards, terminated, truncated, infos
+
+    def answer(self, place: int, text: str) -> dict[str, float]:
+        """End one place's episode with an answer in words; return its metrics. The next step starts the place over.
+
+        Raises:
+            ArgumentError: see `NavigationEnv.answer`.
+        """
+        self._require_episodes()
+        answer_in_words(self.task, self._goals[place], self._states[place], text)
+        self._over[place] = True
+        return self.result(place)
 
     def render(self) -> tuple[NDArray[np.uint8], ...]:
         """Return the front views."""

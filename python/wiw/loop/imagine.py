@@ -25,6 +25,9 @@ NO_SEMANTICS = (
     "(wiw.experiments.semantics.Labelled); see docs/perception.md"
 )
 
+PURPOSE = 0x696D6167
+"""Separates the seeds of futures from those of plans."""
+
 
 @dataclass(frozen=True)
 class ImaginedPrimitives(Imagination):
@@ -215,8 +218,11 @@ def _get_action_ids(accepts: Accepts, actions: NDArray[np.int8]) -> NDArray[Any]
 
 
 def seed_of(key: Key, candidate: int) -> int:
-    """Return the seed of a candidate's future, whatever else is imagined beside it."""
-    return int(core.fold_key([key.seed, key.episode, key.decision, candidate]))
+    """Return the seed of a candidate's future, whatever else is imagined beside it.
+
+    It is of no stream that a policy draws from: what a model draws must not depend on how the plan was drawn.
+    """
+    return int(core.fold_key([key.seed, key.episode, key.decision, candidate, PURPOSE]))
 
 
 def list_depths(inputs: Sequence[ModelInput]) -> list[NDArray[np.float32]]:

@@ -121,7 +121,7 @@ def _split_rows(rows: Sequence[_Row], most: int) -> Iterator[list[int]]:
 def _build_conditioning(accepts: Accepts, inputs: Sequence[ModelInput]) -> Conditioning:
     depth = simulators = None
     if "depth" in accepts.needs:
-        depth = np.stack([resize(value, accepts.size, cv2.INTER_NEAREST) for value in list_depths(inputs)])
+        depth = np.stack([resize(value, accepts.size, cv2.INTER_NEAREST_EXACT) for value in list_depths(inputs)])
     if "simulator" in accepts.needs:
         simulators = [own.simulator for own in inputs]
     image = np.stack([resize(own.observation.front, accepts.size) for own in inputs])

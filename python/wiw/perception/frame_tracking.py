@@ -129,4 +129,4 @@ def _resize_view(image: NDArray[np.uint8], size: Sequence[int]) -> NDArray[np.ui
 def _resize_mask(mask: NDArray[np.bool_], size: Sequence[int]) -> NDArray[np.bool_]:
     if mask.shape == tuple(size):
         return mask
-    return np.asarray(cv2.resize(mask.astype(np.uint8), (size[1], size[0]), interpolation=cv2.INTER_NEAREST)) > 0
+    return np.asarray(cv2.resize(mask.astype(np.uint8), (size[1], size[0]), interpolation=cv2.INTER_NEAREST_EXACT)) > 0

@@ -60,7 +60,7 @@ class TableSetup:
     springs: Mapping[str, float] = field(default_factory=dict)
     """Spring force in newtons, by mechanism."""
     objects: tuple[str, ...] = ()
-    """Names of the objects whose poses a policy knows, in the order of their indices from 1."""
+    """Names of the objects whose poses a policy knows, in any order: a policy gets them sorted."""
 
     def build_workbench(self, backend: Literal["auto", "cpu", "gpu"] = "auto", robot: Robot | None = None) -> Workbench:
         """Build the workbench and let everything come to rest; with the project's own Panda if no robot is given."""

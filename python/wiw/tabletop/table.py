@@ -32,8 +32,8 @@ class Table:
         self.kind, self.setup = kind, setup
         self.bench = setup.build_workbench(backend, robot)
         self.goal = Goal(task, text=setup.instruction)
-        self.objects = setup.objects
-        """Names of the objects whose positions agents know."""
+        self.objects = tuple(sorted(setup.objects))  # a task may name the requested one first
+        """Names of the objects whose positions agents know, in the order of their indices from 1."""
 
     def is_success(self) -> bool:
         """Return whether what is asked for is done."""

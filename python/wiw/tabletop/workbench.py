@@ -226,6 +226,14 @@ class Workbench:
         return np.array([*tip[:3, 3], *angles, self._gripper.opening])
 
     @property
+    def idle_action(self) -> NDArray[np.float64]:
+        """float64 [7]: the pose that changes nothing where the gripper is sent to it, as what is held stays held.
+
+        `pose` does not: fingers around something wide are open, and fingers that are to open let it go.
+        """
+        return np.array([*self.pose[:6], 0.0]) if self._gripper.held is not None else self.pose
+
+    @property
     def _gripper(self) -> Gripper:
         """The gripper; it has no state."""
         return self.robot.create_gripper(self._world, self._arm)

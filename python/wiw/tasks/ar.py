@@ -116,7 +116,8 @@ class AR(NavigationTask):
         centre = ar.centre_of(place, int(episode.info["target"]), f"episode {episode.episode_id}")
         below = np.array([centre[0], episode.start_position[1], centre[2]])
         nearest = place.navmesh.snap(below)
-        return np.asarray(below if nearest is None or not np.isfinite(nearest).all() else nearest, np.float64)
+        known = below if nearest is None or not np.isfinite(nearest).all() else nearest
+        return place.ground.put_down(known).astype(np.float64)
 
     def is_sure(self, state: EpisodeState) -> bool:
         """Return whether the last answer is above the confidence that ends the episode."""

@@ -172,6 +172,9 @@ def test_environments_are_made_as_gymnasium_makes_them(two_rooms: str) -> None:
     assert wiw.make("ImageNav-v0", scenes=two_rooms, render_mode="rgb_array").render_mode == "rgb_array"
     with pytest.raises(ArgumentError, match="expected 'rgb_array'"):
         wiw.make("ImageNav-v0", scenes=two_rooms, render_mode="human")
+    assert wiw.make_vec("ImageNav-v0", 1, scenes=two_rooms, render_mode="rgb_array").render_mode == "rgb_array"
+    with pytest.raises(ArgumentError, match="expected 'rgb_array'"):
+        wiw.make_vec("ImageNav-v0", 1, scenes=two_rooms, render_mode="human")
     with pytest.raises(ArgumentError, match=r"expected the name of a task.*got <class"):
         wiw.make(wiw.Task)
 

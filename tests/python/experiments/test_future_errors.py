@@ -38,12 +38,14 @@ from wiw.loop.model_wrapper import ModelWrapper
 from wiw.loop.plan_space import plan_space
 from wiw.loop.privileged import LiveEnvironments
 from wiw.metrics import psnr, ssim
+from wiw.physics import Box, place
 from wiw.policies.base import FrameSpec
 from wiw.runs.recipes import AgentRecipe, arm_recipes
+from wiw.tabletop.workbench import TABLE, Thing, Workbench
 from wiw.tasks.imagenav import ImageNav
 from wiw.tasks.manipulation import Manipulation
-from wiw.types import GRIPPER_POSES, PRIMITIVES, Key, Proposal
-from wiw.world_models.oracle import Oracle, make_oracle
+from wiw.types import GRIPPER_POSES, PRIMITIVES, Conditioning, Control, Key, Proposal
+from wiw.world_models.oracle import ArmOracle, Oracle, make_oracle
 
 SIZE = (64, 128)
 AHEAD = Proposal([int(FORWARD)] * 4)
@@ -372,6 +374,23 @@ def test_errors_at_a_table(bench) -> None:
     views = {error: drawn.fork().render_fronts_after(here[None], (48, 48)) for error, drawn in benches.items()}
     np.testing.assert_array_equal(views[""], views["missing@0"])
     assert all(not np.array_equal(views[""], views[error]) for error in ("missing@1", "moved@0.1", "invented@1"))
+
+
+@pytest.mark.parametrize("error", ["ignored@1", "lag@1"])
+def test_a_gripper_that_is_not_moved_keeps_what_it_holds(error: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    wide = Thing("block", ((Box([0.06] * 3), np.eye(4)),), (0.8, 0.1, 0.1), mass=0.05)
+    bench = Workbench([(wide, place(0.1, 0.0, TABLE + 0.03))])
+    for height, gripper in ((0.1, 1.0), (0.03, 1.0), (0.03, 0.0), (0.2, 0.0)):
+        bench.move_to([0.1, 0, TABLE + height, np.pi, 0, 0, gripper])
+    assert bench.held_object == "block" and bench.pose[6] > 0.5  # open, as far as the fingers tell
+    control = Control.of_poses(1, "", np.stack([bench.pose, [0.1, 0, TABLE + 0.25, np.pi, 0, 0, 0]]))
+    sent: list[Control] = []
+    monkeypatch.setattr(ArmOracle, "rollout", lambda model, observations, controls, seeds: sent.extend(controls))
+    observations = Conditioning(np.zeros((1, *SIZE, 3), np.uint8), simulators=[bench])
+    make_error(error).rollout(ArmOracle(), observations, [control], np.array([SEED], np.uint64))
+    fork = bench.fork()
+    fork.move_to(sent[0].ids[1])
+    assert fork.held_object == "block" and fork.get_pose("block")[2, 3] > TABLE + 0.15
 
 
 @pytest.mark.parametrize("error", ["flicker@60", "direction@90", "ignored@0.5", "lag@1", "missing@0.5", "moved@0.1"])

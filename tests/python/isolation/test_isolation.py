@@ -452,7 +452,8 @@ import os
 import numpy as np
 
 import wiw
-from wiw._core import core
+from wiw.loop.imagine import seed_of
+from wiw.types import Key
 
 
 class Fatal(wiw.WorldModel):
@@ -462,7 +463,7 @@ class Fatal(wiw.WorldModel):
         self.fatal = fatal
 
     def rollout(self, observations, controls, seeds):
-        own = [core.fold_key([0, self.fatal, d, c]) for d in range(9) for c in range(3)] if self.fatal >= 0 else []
+        own = [seed_of(Key(0, self.fatal, d), c) for d in range(9) for c in range(3)] if self.fatal >= 0 else []
         if set(own) & set(map(int, seeds)):
             os._exit(3)
         return np.repeat(observations.image[:, None], 1 + len(controls[0].actions), 1)

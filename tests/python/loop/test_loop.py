@@ -10,12 +10,12 @@ import numpy as np
 import pytest
 
 import wiw
-from wiw._core import core
 from wiw.action import FORWARD, TURN_LEFT, TURN_RIGHT, GripperTextTemplate, GripperVocabulary, TextTemplate
 from wiw.errors import ArgumentError, ContractError
 from wiw.experiments.fidelity import FidelityObserver
 from wiw.loop.attempts import TRIES, Attempted
 from wiw.loop.config import AgentConfig
+from wiw.loop.imagine import seed_of
 from wiw.loop.memory import Query
 from wiw.loop.scheduler import run_episodes
 from wiw.policies.base import FrameSpec
@@ -235,7 +235,7 @@ def test_a_model_that_hangs_fails_its_episode_and_the_rest_goes_on(task: ImageNa
         """Never answers the first decision of episode 1."""
 
         def rollout(self, observations, controls, seeds):
-            if {core.fold_key([0, 1, 0, c]) for c in range(4)} & set(seeds.tolist()):
+            if {seed_of(Key(0, 1, 0), c) for c in range(4)} & set(seeds.tolist()):
                 release.wait(60)
             return super().rollout(observations, controls, seeds)
 
@@ -251,7 +251,7 @@ def test_what_fails_does_not_depend_on_what_else_is_live(task: ImageNav, live: i
         """Cannot stand the third decision of episode 1."""
 
         def rollout(self, observations, controls, seeds):
-            bad = {core.fold_key([0, 1, 2, c]) for c in range(4)}
+            bad = {seed_of(Key(0, 1, 2), c) for c in range(4)}
             if bad & set(seeds.tolist()):
                 raise RuntimeError("not this one")
             return super().rollout(observations, controls, seeds)

@@ -17,6 +17,7 @@ from wiw.envs.base import Env, Guide, Segment
 from wiw.errors import ArgumentError, ContractError
 from wiw.experiments.ground_truth import TruePlans, TrueScores
 from wiw.experiments.placebos import ShuffledPlacebo
+from wiw.loop import imagine_poses
 from wiw.loop.clock import Clock
 from wiw.loop.imagination import ModelInput, Request
 from wiw.loop.plan_space import plan_space
@@ -418,3 +419,11 @@ def test_plans_that_are_none_are_refused(poses: Any, said: str) -> None:
     observation = env.begin(DotTask().episodes(1)[0])
     with pytest.raises(ContractError, match=said):
         wiw.Agent(Careless()).decide(observation, env.goal, Key(0, 0))
+
+
+def test_depth_is_of_the_pixels_in_whose_middle_it_is() -> None:
+    depth = np.arange(480 * 480, dtype=np.float32).reshape(480, 480)
+    observation = ArmObservation(np.zeros((480, 480, 3), np.uint8), np.array(HOME), depth)
+    accepts = wiw.accepts(control="action", space="pose7", size=(160, 96), view="perspective", needs=("depth",))
+    shown = imagine_poses._build_conditioning(accepts, [ModelInput(observation)])
+    np.testing.assert_array_equal(shown.depth[0], depth[1::3, 2::5])

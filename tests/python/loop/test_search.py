@@ -16,6 +16,7 @@ import wiw
 from wiw._core import core
 from wiw.action import FORWARD, STOP, TURN_LEFT, TURN_RIGHT, to_trajectory
 from wiw.errors import ArgumentError
+from wiw.loop.imagine import seed_of
 from wiw.loop.memory import Query
 from wiw.loop.search import move
 from wiw.types import Goal, Key, Observation, Proposal
@@ -167,13 +168,18 @@ def test_a_wide_beam_is_exhaustive_search() -> None:
     assert every[tuple(decision.actions.tolist())] == max(every.values())
 
 
+def test_a_future_is_not_drawn_from_the_stream_of_its_plan() -> None:
+    for key, number in ((Key(0, 17, 3), 2), (Key(1, 0, 0), 0)):
+        assert seed_of(key, number) != core.fold_key([key.seed, key.episode, key.decision, number])
+
+
 def test_imagining_deeper_leaves_the_real_memory_alone_and_keeps_seeds() -> None:
     model = model_of()
     agent = wiw.Agent(Wanderer(), model, candidates=CANDIDATES, horizon=HORIZON, depth=3)
     decision = agent.decide_batch([query(0, 90)])[0]
     memory = agent.parts.memories.recall([query(0, 90)], agent.parts.imaginer)[0][0].memory
     assert memory.observed == [90]
-    assert model.seeds <= {core.fold_key([5, 0, 2, c]) for c in range(CANDIDATES)}
+    assert model.seeds <= {seed_of(Key(5, 0, 2), c) for c in range(CANDIDATES)}
     assert len(decision.proposals) > CANDIDATES and decision.calls["rows"] > len(decision.proposals)
 
 

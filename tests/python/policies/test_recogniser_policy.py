@@ -90,6 +90,10 @@ def test_a_plan_goes_round_what_is_in_the_way() -> None:
     assert steering.plan_towards(np.pi / 4, free, 4).tolist() == [TURN_LEFT, TURN_LEFT, FORWARD, FORWARD]
     free[2] = 0.3
     assert steering.plan_towards(np.pi / 4, free, 4).tolist() == [TURN_LEFT, FORWARD, FORWARD, FORWARD]
+    assert steering.plan_towards(np.pi / 4 * 3.5, np.where(np.isin(np.arange(16), [3, 9]), 3.0, 0.3), 8).tolist() == [
+        *[TURN_RIGHT] * 7,
+        FORWARD,
+    ]  # nine turns left of it, and so two from the wanted seven
     assert steering.plan_towards(np.pi, np.zeros(16), 3).tolist().count(FORWARD) == 0
     assert (
         steering.plan_towards(0.0, np.full(16, np.inf), 4).tolist() == [FORWARD] * 4

@@ -614,6 +614,8 @@ def test_options_out_of_range() -> None:
     for of_targets in ({"tracker": "flow"}, {"rounds": True}, {"answer_view": "target"}, {"tracker_options": {"a": 1}}):
         with pytest.raises(ArgumentError, match="only for tasks that point a target out"):
             make_policy(None, **of_targets)
+        with pytest.raises(ArgumentError, match="only for tasks that point a target out"):
+            make_vlm(task="imagenav", vlm="mock", **of_targets)
     with pytest.raises(ArgumentError, match="instance ids"):
         make_vlm(task="aeqa", vlm="mock", perception=wiw.registry.LABELLERS.make("oracle", instances=[]))
     with pytest.raises(ArgumentError, match="create it with task='aeqa'"):

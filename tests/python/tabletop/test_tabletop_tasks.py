@@ -11,6 +11,7 @@ from wiw.errors import ArgumentError
 from wiw.physics import place
 from wiw.tabletop.base import PALETTE, is_holding
 from wiw.tabletop.link_meshes import build_link_meshes
+from wiw.tabletop.table import Table
 from wiw.tabletop.tasks import TABLETOP_TASKS, find_task
 from wiw.tabletop.workbench import TABLE, Workbench
 from wiw.types import ArmObservation
@@ -132,3 +133,11 @@ def test_cups_that_are_stacked_are_left() -> None:
     places = dict(zip(setup.objects, [place(0.1, 0.1, TABLE + 0.025 * level) for level in range(3)], strict=True))
     plan = kind.plan_expert(places, setup.target)
     assert plan.shape == (1, 7) and plan[0, 2] > TABLE + 0.15 and plan[0, 6] == 1
+
+
+@pytest.mark.parametrize("name", sorted(TABLETOP_TASKS))
+def test_the_order_of_objects_says_nothing_of_what_is_asked(name: str) -> None:
+    task = TABLETOP_TASKS[name]
+    for seed in range(3):
+        objects = Table(task, task.create_setup(seed, seed)).objects
+        assert list(objects) == sorted(objects) and len(objects) > 1

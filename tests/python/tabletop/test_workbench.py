@@ -3,6 +3,9 @@
 
 from __future__ import annotations
 
+import re
+from textwrap import dedent
+
 import numpy as np
 import pytest
 from egl import needs_egl
@@ -10,6 +13,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
+from wiw import physics
 from wiw.action import PoseGrid
 from wiw.errors import ArgumentError
 from wiw.physics import Articulation, Box, Capsule, ConvexHull, Cylinder, Sphere, place
@@ -268,3 +272,10 @@ def test_the_wrist_camera_goes_with_the_arm(bench: Workbench) -> None:
     )
     np.testing.assert_array_equal(bench.get_camera_pose("front"), fixed)
     assert bench.joints.shape == (9,) and (np.abs(bench.joints[:7]) < 4).all()
+
+
+def test_the_example_of_the_physics_grasps_its_cube() -> None:
+    example = dedent(re.search(r"( {4}world = World.*?\n)\n?$", physics.__doc__, re.DOTALL)[1])
+    names = dict(vars(physics))
+    exec(example.replace("Gripper(world).close()", "held = Gripper(world).close()"), names)
+    assert names["held"] == names["cube"]

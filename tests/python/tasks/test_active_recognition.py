@@ -183,6 +183,14 @@ def test_a_lost_target_ends_an_episode_where_the_rules_say_so(
     assert segment.terminated is ended
 
 
+def test_the_goal_is_on_the_floor(file: Path) -> None:
+    task = AR(episode_file=file)
+    episode = task.episode(0)
+    place = task.open_world(episode)
+    goal = task.find_goal_position(place, episode)
+    np.testing.assert_allclose(goal, place.ground.put_down(goal), atol=1e-6)
+
+
 def test_an_answer_is_a_step_of_gymnasiums_too(file: Path) -> None:
     env = wiw.make("AR-v0", episode_file=file)
     for choice, reward in ((CHOICES.index("table"), 1.0), (CHOICES.index("chest"), 0.0)):

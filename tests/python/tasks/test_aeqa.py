@@ -207,6 +207,20 @@ def test_stopping_ends_without_an_answer_and_an_answer_ends_what_is_stepped(epis
     assert stepped.result()["success"] == 1
 
 
+def test_many_are_answered_one_by_one(episode):
+    many = wiw.make_vec("AEQA-v0", 2, scenes=SCENE, depth=False)
+    many.task._episodes, many.task.wrap_index = [episode], lambda number: 0
+    many.reset(options={"episode": [0, 0]})
+    assert many.answer(1, "blue")["success"] == 1
+    with pytest.raises(ArgumentError, match=r"the episode has ended.*the next step"):
+        many.answer(1, "red")
+    _, rewards, terminated, _, infos = many.step([int(FORWARD), int(FORWARD)])
+    assert rewards.tolist() == [0, 0] and not terminated.any() and "result" not in infos
+    assert [state.actions for state in many._states] == [1, 0]  # the second has begun anew
+    with pytest.raises(ArgumentError, match="reply to a question"):
+        many.answer(0, " ")
+
+
 # -- what policies are given and must return ---------------------------------------------------------------------------
 
 

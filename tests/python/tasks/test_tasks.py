@@ -170,16 +170,19 @@ def test_a_task_without_a_seed_runs_and_is_refused_with_one(tmp_path: Path, caps
 
 
 def test_the_example_of_a_variant_runs_under_the_presets_of_what_it_derives_from(two_rooms: str) -> None:
-    name = f"{EXAMPLES / 'patient_imagenav.py'}:PatientImageNav"
+    name = f"{EXAMPLES / 'walkable_imagenav.py'}:WalkableImageNav"
     task = TASKS.make(name, scenes=two_rooms)
     assert task.rules == ImageNav().rules and TASKS.make(name, preset="official").rules.decisions == 21
-    env = task.environment()
+    env, longer = task.environment(), TASKS.make(name, scenes=two_rooms, radius=50.0).environment()
     env.begin(task.episode(0))
-    plan = env.guide().suggest_plan(60)
-    assert not env.run(plan[:30]).terminated or env.state.success is False
-    while env.state.distance_to_goal() > 0.5:
-        env.run(env.guide().suggest_plan(1))
-    assert not env.state.success and env.run([STOP]).terminated and env.result()["success"] == 1
+    assert env.state.distance_to_goal() > 0.5 and env.run(env.guide().suggest_plan(60)).terminated
+    assert env.result()["success"] == 1
+    longer.begin(task.episode(0))
+    state = longer.state
+    state.geodesic_to_goal = lambda: 100.1
+    assert not longer.run([TURN_LEFT]).terminated
+    state.geodesic_to_goal = lambda: 100.0
+    assert longer.run([TURN_LEFT]).terminated and longer.result()["success"] == 1
     with pytest.raises(
         ArgumentError,
         match=r"no preset 'offical'; choose from default, paper, .*Did you mean official\?",
@@ -189,11 +192,14 @@ def test_the_example_of_a_variant_runs_under_the_presets_of_what_it_derives_from
 
 def test_a_variant_is_asked_with_the_prompts_of_what_it_derives_from(two_rooms: str, tmp_path: Path) -> None:
     pytest.importorskip("pydantic")
-    name, policy = f"{EXAMPLES / 'patient_imagenav.py'}:PatientImageNav", wiw.policy("vlm", vlm="mock", task="imagenav")
+    name, policy = (
+        f"{EXAMPLES / 'walkable_imagenav.py'}:WalkableImageNav",
+        wiw.policy("vlm", vlm="mock", task="imagenav"),
+    )
     how: Any = {"scenes": two_rooms, "decisions": 1, "out": tmp_path / "run", "progress": False}
     log = wiw.evaluate(name, wiw.Agent(policy, "copy"), 1, **how)
     assert [row["status"] for row in log.episodes] == ["done"]
-    assert log.store.config["task"]["task"] == "patient-imagenav"
+    assert log.store.config["task"]["task"] == "walkable-imagenav"
 
 
 def test_a_task_with_rules_of_its_own_needs_no_preset(two_rooms: str, tmp_path: Path) -> None:

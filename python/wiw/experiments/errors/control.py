@@ -21,6 +21,7 @@ from wiw.errors import ArgumentError
 from wiw.experiments.errors.base import Degradation, make_generator, per_space
 from wiw.experiments.errors.forks import Walker, WorldFork
 from wiw.metrics import pose_error
+from wiw.tabletop.workbench import Workbench
 from wiw.types import GRIPPER_POSES, Conditioning, Control
 from wiw.world_models.base import WorldModel
 
@@ -45,11 +46,14 @@ class MotionDegradation(Degradation):
         seeds: NDArray[np.uint64],
     ) -> NDArray[np.uint8]:
         """Return what the oracle truly sees where this error takes it."""
-        if model.accepts.space == GRIPPER_POSES:
-            pairs = zip(controls, seeds, strict=True)
-            changed = [replace(own, ids=self._send_gripper(own.ids, int(seed))) for own, seed in pairs]
-            return model.rollout(observations, changed, seeds)
         assert observations.simulators is not None
+        if model.accepts.space == GRIPPER_POSES:
+            triples = zip(controls, observations.simulators, seeds, strict=True)
+            changed = [
+                replace(own, ids=self._send_gripper(_make_idle(own.ids, bench), int(seed)))
+                for own, bench, seed in triples
+            ]
+            return model.rollout(observations, changed, seeds)
         forks = zip(observations.simulators, seeds, strict=True)
         errant = [_ErrantFork(fork, self, int(seed)) for fork, seed in forks]
         return model.rollout(replace(observations, simulators=errant), controls, seeds)
@@ -98,6 +102,11 @@ class _ErrantFork:
 
     def camera_poses_after(self, actions: NDArray[np.int8]) -> NDArray[np.float64]:
         return self.error.find_camera_poses(self.fork, actions, self.seed)
+
+
+def _make_idle(poses: Poses, bench: Workbench) -> Poses:
+    """Return the poses, the present one as an action that changes nothing: an error may repeat it as one."""
+    return np.concatenate([bench.idle_action[None], poses[1:]])
 
 
 def list_moves(actions: NDArray[np.int8]) -> Moves:

@@ -129,7 +129,8 @@ def plan_towards(heading: float, free: NDArray[np.float64], horizon: int) -> NDA
 
 def _compute_cost(turn: int, wanted: int, free: NDArray[np.float64]) -> float:
     """Return the number of turns off the wanted heading; headings that are not clear come last."""
-    return abs(turn - wanted) + (100.0 if free[turn % len(free)] < MIN_CLEARANCE else 0.0)
+    off = abs(turn - wanted) % len(free)
+    return min(off, len(free) - off) + (100.0 if free[turn % len(free)] < MIN_CLEARANCE else 0.0)
 
 
 def compute_target_place(observation: Observation, seen: TargetSighting) -> NDArray[np.float64]:

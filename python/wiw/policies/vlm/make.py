@@ -7,9 +7,12 @@ import inspect
 from typing import Any
 
 from wiw.policies.vlm.arm.policy import ArmVLM
-from wiw.policies.vlm.policy import VLM
+from wiw.policies.vlm.policy import VLM, refuse_tracking
 from wiw.policies.vlm.questions.policy import QuestionVLM
 from wiw.types import GRIPPER_POSES, PRIMITIVES
+
+TRACKING = frozenset(inspect.signature(refuse_tracking).parameters)
+"""Options that are of no use without a target."""
 
 
 def make_vlm(space: str = PRIMITIVES, task: str = "", **options: Any) -> VLM:
@@ -18,6 +21,7 @@ def make_vlm(space: str = PRIMITIVES, task: str = "", **options: Any) -> VLM:
     `VLM` documents the options, and `QuestionVLM` those of task "aeqa".
     """
     if task == "imagenav":  # which points nothing out
+        refuse_tracking(**{name: options[name] for name in TRACKING.intersection(options)})
         options["tracker"] = None
     kind = ArmVLM if space == GRIPPER_POSES else QuestionVLM if task in QuestionVLM.tasks else VLM
     return kind(**options)

@@ -165,13 +165,8 @@ class VLM(Policy):
                 "policy vlm: expected shown strip or frames, and these or captions=False only for tasks "
                 f"{', '.join(VLM.tasks)}, got shown={shown}, captions={captions}"
             )
-        if not self.tracks and (
-            tracker not in (None, "frames") or tracker_options or rounds or answer_view != "observation"
-        ):
-            raise ArgumentError(
-                "policy vlm: tracker, tracker_options, rounds and answer_view are only for tasks that point a target "
-                "out in the view, such as ar; leave them out"
-            )
+        if not self.tracks:
+            refuse_tracking(tracker, tracker_options, rounds, answer_view)
         _require_packages()
         self.prompts = Prompts(prompts)
         table = None if prices is None else Prices.load(prices)
@@ -607,6 +602,24 @@ def _get_role_options(own: Mapping[str, Any], vlm: Any, client: Mapping[str, Any
         return {**preset, **client, **key}
     # what was given describes the main server, and its key is for nobody else
     return {**_leave_out_key(client), **preset, **key}
+
+
+def refuse_tracking(
+    tracker: Any = None,
+    tracker_options: Mapping[str, Any] | None = None,
+    rounds: bool = False,
+    answer_view: str = "observation",
+) -> None:
+    """Refuse options of a policy that are of no use without a target.
+
+    Raises:
+        ArgumentError: one of them is given.
+    """
+    if tracker not in (None, "frames") or tracker_options or rounds or answer_view != "observation":
+        raise ArgumentError(
+            "policy vlm: tracker, tracker_options, rounds and answer_view are only for tasks that point a target "
+            "out in the view, such as ar; leave them out"
+        )
 
 
 def derive_seed(key: Key, number: int) -> int:
