@@ -46,6 +46,12 @@ _PREPOSITIONS = frozenset({
 _COPULAS = _FORMS_OF_BE | {"look", "appear", "seem", "called"}
 _NOTICED = frozenset({"see", "seen", "find", "found", "have", "has", "had", "can", "could", "did", "any"})
 """Words of an answer to "is there ...?" that say no more than "there is"."""
+_DOUBTS = frozenset({"if", "whether", "might", "may", "know", "tell", "sure", "certain"})
+"""Words before a statement that leave open whether it holds."""
+_CONTINUING = frozenset({
+    "and", "or", "there", "here", "that", "which", "too", "also", "as", "visible", "present", "anywhere", "somewhere",
+})  # fmt: skip
+"""Words that go on behind a thing, so that they are no part of its name as in "piano stool"."""
 _VERBS = _FORMS_OF_BE | _NOTICED - {"any"} | {"do", "does", "think"}
 """Words of which a statement has one; "it" alone affirms nothing."""
 _OPPOSITES = (("open", "closed"), ("on", "off"), ("made", "unmade"))
@@ -202,7 +208,43 @@ def _compare_statement(text: str, question: str, negated: bool) -> bool | None:
     colors = [{m.concept for m in vocabulary.find(words, ["color"])} for words in (asked, said)]
     if all(colors) and not negated:
         return colors[0] == colors[1]
-    return _compare_content(normalise(text).split(), normalise(question).split(), negated)
+    says = _read_presence(text, question)
+    return says if says is not None else _compare_content(normalise(text).split(), normalise(question).split(), negated)
+
+
+def _read_presence(text: str, question: str) -> bool | None:
+    """Return whether a statement says that there is what "is there ...?" asks for; None if it does not say, or both."""
+    thing = _find_asked_thing(normalise(question).split())
+    rooms = set(find_concepts(question, ["room"], head=False))
+    found = {
+        _says_presence(normalise(" ".join(clause)).split(), thing)
+        for clause in (split_clauses(text) if thing else [])
+        if not (named := set(find_concepts(" ".join(clause), ["room"], head=False))) or not rooms or named & rooms
+    } - {None}
+    return found.pop() if len(found) == 1 else None
+
+
+def _find_asked_thing(asked: Sequence[str]) -> Sequence[str]:
+    """Return the words for what "is there ...?" asks for; none of another question."""
+    if asked[1:2] != ["there"] or asked[0] not in _FORMS_OF_BE:
+        return []
+    return asked[2 : next((place for place, word in enumerate(asked) if word in _PREPOSITIONS), len(asked))]
+
+
+def _says_presence(words: Sequence[str], thing: Sequence[str]) -> bool | None:
+    """Return whether a clause says that there is a thing, as "there is a black piano by the wall" does of a piano.
+
+    "A picture of a piano", "a piano stool" and "I am not sure that there is a piano" say neither.
+    """
+    place = next((at for at in range(len(words)) if words[at : at + len(thing)] == thing), None)
+    if place is None or not _VERBS & set(words):
+        return None
+    before, after = words[:place], words[place + len(thing) :]
+    if _DOUBTS & set(before) or before[-1:] in (["of"], ["for"]) or NEGATIONS & set(after):
+        return None
+    if after and after[0] not in _PREPOSITIONS | _VERBS | _CONTINUING:
+        return None
+    return not (NEGATIONS | {"0"}) & set(before)
 
 
 def _compare_content(said: Sequence[str], asked: Sequence[str], negated: bool) -> bool | None:
@@ -211,10 +253,9 @@ def _compare_content(said: Sequence[str], asked: Sequence[str], negated: bool) -
     Where a question begins with "is there", "I see two" says so of what it asks for.
     """
     content = set(said) - NEGATIONS - _FORMS_OF_BE - _PLACEHOLDERS
-    if asked[1:2] == ["there"] and asked[0] in _FORMS_OF_BE:
-        stop = next((place for place, word in enumerate(asked) if word in _PREPOSITIONS), len(asked))
+    if thing := _find_asked_thing(asked):
         content -= _NOTICED | {word for word in content if word.isdecimal() and word != "0"}
-        if content and not content & set(asked[2:stop]):
+        if content and not content & set(thing):
             return None
     if not content <= set(asked) or not (negated or _VERBS & set(said)):
         return None

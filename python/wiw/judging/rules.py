@@ -25,7 +25,7 @@ from wiw.judging.normalise import affirms_words, find_concepts, find_states, nor
 from wiw.judging.places import mark_place, names_place
 from wiw.judging.vocabulary import Concept, Kind, Relation, load_vocabulary
 
-RULES_VERSION = 3
+RULES_VERSION = 4
 """Raised when an answer may get another mark than before, beside changes of the vocabulary."""
 OFF_BY_ONE_MARK = 2
 COLOR_MARKS = {Relation.SAME: 5, Relation.BROADER: 4, Relation.NEAR: 3}

@@ -62,6 +62,26 @@ PAIRS = [  # type, question, right answer, answer, mark
     ("yes_no", PIANO, "yes", "I don't know", 1),
     ("yes_no", PIANO, "yes", "I", 1),  # cut off
     ("yes_no", "Is there a sofa in the study?", "yes", "there is a couch", 5),
+    ("yes_no", PIANO, "yes", "There is a black piano in the living room.", 5),
+    ("yes_no", PIANO, "yes", "there's a grand piano", 5),
+    ("yes_no", PIANO, "yes", "There is a piano in the living room, next to the sofa.", 5),
+    ("yes_no", PIANO, "yes", "I can see a piano against the wall of the living room", 5),
+    ("yes_no", PIANO, "yes", "there is a sofa and a piano", 5),
+    ("yes_no", PIANO, "yes", "there is a piano, not a guitar", 5),
+    ("yes_no", PIANO, "no", "There is a black piano in the living room.", 1),
+    ("yes_no", PIANO, "no", "There is no piano, only a sofa and a table", 5),
+    ("yes_no", PIANO, "no", "There does not appear to be a piano", 5),
+    ("yes_no", PIANO, "no", "I can't see a piano anywhere in the living room", 5),
+    ("yes_no", PIANO, "no", "a piano is not in the living room", 5),
+    ("yes_no", PIANO, "yes", "There does not appear to be a piano", 1),
+    ("yes_no", PIANO, "yes", "there is a piano in the kitchen", 1),
+    ("yes_no", PIANO, "no", "there is a piano in the kitchen", 1),
+    ("yes_no", PIANO, "yes", "there is a piano stool", 1),
+    ("yes_no", PIANO, "yes", "there is a picture of a piano", 1),
+    ("yes_no", PIANO, "yes", "I am not sure whether there is a piano", 1),
+    ("yes_no", PIANO, "no", "I am not sure whether there is a piano", 1),
+    ("yes_no", PIANO, "yes", "there might be a piano", 1),
+    ("yes_no", PIANO, "no", "I don't know if there is a piano", 1),
     ("count", COUNT, "4", "4", 5),
     ("count", COUNT, "four", "4", 5),
     ("count", COUNT, "4", "there are four chairs", 5),
@@ -382,5 +402,5 @@ def test_judgements_and_judges_describe_themselves_as_json() -> None:
     assert Judgement.from_info(json.loads(json.dumps(judgement.to_info()))) == judgement
     rules, both = RuleJudge().describe(), make_judge("rules").describe()
     assert json.loads(json.dumps(both)) == both and both["tiers"][0] == rules
-    assert rules["version"] == 3 and rules["vocabulary"] == load_vocabulary().digest
+    assert rules["version"] == 4 and rules["vocabulary"] == load_vocabulary().digest
     assert make_judge("approximate").describe() != both
