@@ -80,7 +80,7 @@ def collect_navigation(
     options |= {"perspective": perspective, "depth": depth, "lossless": lossless, "backend": backend}
     options["rules"] = parse_options(rule, NavigationRules, "--rule")
     if dry_run:
-        return _estimate(scenes, options)
+        return _estimate(scenes, {**options, "skip_errors": skip_errors})
     began = time.monotonic()
     with announce_resume(), Bars() as bars:
         data = collect_navigation(
@@ -92,8 +92,7 @@ def collect_navigation(
         f"{totals['bytes'] / 1e9:.2f} GB, in {time.monotonic() - began:.0f} s; "
         f"{totals['dropped']} waypoint{'' if totals['dropped'] == 1 else 's'} could not be reached"
     )
-    for scene, error in data.meta["left_out"].items():
-        print(f"skipped   {scene}: {error}")
+    _print_skipped(data.meta["left_out"])
     print(f"written   {out}")
     return 0
 
@@ -110,4 +109,10 @@ def _estimate(scenes: tuple[str, ...], options: Mapping[str, Any]) -> int:
             scenes, progress=lambda scene, done, total: bars.show("planned", done, total, scene), **options
         )
     print(found)
+    _print_skipped(found.left_out)
     return 0
+
+
+def _print_skipped(errors: Mapping[str, str]) -> None:
+    for scene, error in errors.items():
+        print(f"skipped   {scene}: {error}")

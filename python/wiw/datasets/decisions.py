@@ -126,7 +126,7 @@ def digest_decisions(path: str | Path) -> str:
 
 def _open(path: str | Path) -> RowGroupFile:
     require_pyarrow("stored decisions")
-    return RowGroupFile(Path(path), FORMAT, "stored decisions")
+    return RowGroupFile(Path(path), FORMAT, "stored decisions", "`wiw collect decisions`")
 
 
 def _build_tables(decisions: Decisions, schema: Any) -> Iterator[Any]:

@@ -25,13 +25,13 @@ from wiw.datasets.navigation_card import build_card
 from wiw.datasets.navigation_files import FORMAT, SEGMENTS, FrameFile, read_segment_list
 from wiw.datasets.navigation_segment import NavigationSegment
 from wiw.datasets.parquet_files import MANIFEST, require_pyarrow
-from wiw.datasets.scene_splits import find_shared_scene
+from wiw.datasets.scene_splits import find_shared_scene, shorten_name
 from wiw.errors import ArgumentError, FileError
 from wiw.files import atomic_file
 from wiw.mapping_files import read_json_object
 from wiw.scenes import strip_edits
 
-META = "meta.json"
+META, CARD = "meta.json", "README.md"
 Part = Literal["all", "train", "held-out"]
 
 
@@ -42,7 +42,8 @@ class NavigationData(Sequence[NavigationSegment]):
         folder: with `meta.json`.
         part: "all"; or "train" or "held-out", two parts without a scene in common; an edited apartment is in the
             part of the one that it is a copy of.
-        held_out: share of the scenes that are held out, chosen by a hash of their names.
+        held_out: share of the scenes that are held out, chosen by a hash of their names; those of files of one name
+            are together.
 
     Raises:
         DependencyError: pyarrow is not installed.
@@ -60,7 +61,7 @@ class NavigationData(Sequence[NavigationSegment]):
         self.meta = read_meta(self.folder)
         """Camera, encoding, rules, scenes and checksums."""
         rows = read_segment_list(self.folder / SEGMENTS)
-        self.segments = [row for row in rows if part == "all" or part == part_of(row["scene"], held_out)]
+        self.segments = [row for row in rows if part == "all" or part == part_of(shorten_name(row["scene"]), held_out)]
         """Rows of `segments.parquet`: scene, file, row group, frames and action counts of each segment."""
         self._files: dict[str, FrameFile] = {}
 
@@ -224,6 +225,8 @@ def _require_size(path: Path, expected: int | None) -> None:
 def part_of(name: str, held_out: float) -> Literal["train", "held-out"]:
     """Return the part that a scene or demonstration belongs to, by a hash of its name: adding some moves no other.
 
+    The name of a scene is the one that it has whatever other scenes there are, `scene_splits.shorten_name`.
+
     An edited apartment belongs to the part of the one that it is a copy of.
     """
     number = int.from_bytes(blake2b(strip_edits(name).encode(), digest_size=8).digest(), "little")
@@ -268,7 +271,7 @@ def write_meta(folder: Path, meta: Mapping[str, Any]) -> None:
     Raises:
         FileError: they cannot be written.
     """
-    with atomic_file(folder / "README.md") as draft:
+    with atomic_file(folder / CARD) as draft:
         draft.write_text(build_card(meta))
     with atomic_file(folder / META) as draft:
         draft.write_text(json.dumps(meta) + "\n")

@@ -103,19 +103,23 @@ class RowGroupFile:
         path: of the file.
         form: format number that it must have.
         what: what is in it, for messages.
+        source: the command that writes such files, for messages, where the user has named the file, which may be any;
+            None for one of a folder that wiw has written.
 
     Raises:
         FileError: it does not exist, is damaged, or is of another format.
     """
 
-    def __init__(self, path: Path, form: int, what: str) -> None:
+    def __init__(self, path: Path, form: int, what: str, source: str | None = None) -> None:
         from pyarrow import ArrowException, parquet
 
-        self.path, self._what = path, what
+        self.path, self._what, self._source = path, what, source
         try:
             self._metadata = parquet.read_metadata(path)
             self.facts: dict[str, Any] = dict(json.loads(self._metadata.metadata[KEY]))
         except FileNotFoundError as error:
+            if source is not None:
+                raise FileError(f"{path} does not exist; expected a file of {what}, which {source} writes") from error
             raise FileError(f"{path} is missing; recreate it by repeating the `wiw collect` command") from error
         except (OSError, ArrowException, KeyError, TypeError, ValueError, RecursionError) as error:
             raise self.build_damage_error(error) from error
@@ -158,6 +162,11 @@ class RowGroupFile:
 
     def build_damage_error(self, error: Exception) -> FileError:
         """Return an error that says what to do about a damaged file."""
+        if self._source is not None:
+            return FileError(
+                f"{self.path}: expected a complete file of {self._what}, which {self._source} writes, got another or a "
+                f"damaged one ({error}); name one that it has written, or write it anew"
+            )
         return FileError(
             f"{self.path}: expected a complete file of {self._what}, got a damaged one ({error}); delete it and "
             "recreate it by repeating the `wiw collect` command"

@@ -74,7 +74,7 @@ def _tell_apart(name: str, specs: Sequence[str]) -> dict[str, str]:
         return {specs[0]: name}
     choices, seen = [_list_ends(spec) for spec in specs], dict[str, int]()
     for number, (spec, ends) in enumerate(zip(specs, choices, strict=True)):
-        file = spec if is_generated(spec) else str(Path(spec).expanduser().resolve())
+        file = spec if is_generated(spec) else _resolve(spec)
         for key in (file, ends[-1]):
             if (first := seen.setdefault(key, number)) != number:
                 raise _build_twin_error(name, specs[first], spec)
@@ -114,8 +114,17 @@ def find_shared_scene(specs: Iterable[str], names: Iterable[str]) -> str | None:
 
 
 def _list_possible_names(spec: str) -> list[str]:
-    """Return all names that a scene has in some dataset: there, other scenes may share its file's name or not."""
-    return [strip_edits(name) for name in (name_scene(spec), *_list_ends(spec))]
+    """Return all names that a scene has in some dataset: there, other scenes may share its file's name or not.
+
+    A link has its own names and those of what it leads to.
+    """
+    places = [spec] if is_generated(spec) else [spec, _resolve(spec)]
+    return [strip_edits(name) for place in places for name in (name_scene(place), *_list_ends(place))]
+
+
+def _resolve(spec: str) -> str:
+    """Return the path of a scene's file, whatever links and ".." lead there."""
+    return str(Path(spec).expanduser().resolve())
 
 
 def match_names(names: Iterable[str], others: Iterable[str]) -> list[tuple[str, str]]:
@@ -132,6 +141,11 @@ def match_names(names: Iterable[str], others: Iterable[str]) -> list[tuple[str, 
     return sorted(pairs | {(name, short) for name in first for short in _shorten(name) if short in second})
 
 
+def shorten_name(name: str) -> str:
+    """Return the shortest name that a scene has in any dataset, of its name in one: "mesh" for "a/mesh"."""
+    return _shorten(name)[-1]
+
+
 def _shorten(name: str) -> list[str]:
     """Return a name and all shorter ones that its scene has in other datasets."""
     if is_generated(name):
@@ -144,12 +158,17 @@ def find_evaluation_split(spec: str | PathLike[str]) -> str | None:
     """Return the split of a single scene that is for evaluation: "val", "test" or alike; None for any other scene.
 
     Generated apartments and Matterport3D's scenes are known by name, scans of HM3D by the numbers of their folders,
-    files of other datasets by the names of the folders above them.
+    files of other datasets by the names of the folders above them, both where a link is and where it leads.
     """
     spec = fspath(spec)
     if is_generated(spec):
         return find_named_split(spec)
-    path = Path(spec).expanduser().absolute()
+    places = (normpath(Path(spec).expanduser().absolute()), _resolve(spec))
+    return next((split for place in places if (split := _find_place_split(Path(place))) is not None), None)
+
+
+def _find_place_split(path: Path) -> str | None:
+    """Return the split for evaluation that an absolute path tells of; None if it tells of none."""
     named = (find_named_split(part.partition(".")[0]) for part in path.parts)
     folders = (_find_folder_split(part.lower()) for part in path.parent.parts)
     return next((split for split in (*named, _find_numbered_split(path), *folders) if split is not None), None)

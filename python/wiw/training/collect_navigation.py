@@ -11,7 +11,9 @@ from __future__ import annotations
 import json
 import shutil
 from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Set as AbstractSet
 from dataclasses import dataclass
+from functools import partial
 from os import PathLike
 from pathlib import Path
 from typing import Any
@@ -19,7 +21,14 @@ from typing import Any
 import numpy as np
 
 import wiw
-from wiw.datasets.navigation import NavigationData, count_totals, read_meta, read_navigation_manifest, write_meta
+from wiw.datasets.navigation import (
+    CARD,
+    NavigationData,
+    count_totals,
+    read_meta,
+    read_navigation_manifest,
+    write_meta,
+)
 from wiw.datasets.navigation_files import (
     FORMAT,
     SEGMENTS,
@@ -32,13 +41,14 @@ from wiw.datasets.navigation_files import (
 )
 from wiw.datasets.navigation_segment import describe_segment
 from wiw.datasets.parquet_files import require_pyarrow
+from wiw.datasets.scene_sources import digest_scenes
 from wiw.datasets.scene_splits import find_evaluation_split, name_scenes
 from wiw.datasets.worlds import World, world
 from wiw.errors import ArgumentError, BackendError, Error, FileError, InfrastructureError
 from wiw.files import atomic_file
 from wiw.ray_cluster import HERE, Engine
 from wiw.scenes import resolve
-from wiw.training.jobs import open_folder, run_jobs
+from wiw.training.jobs import open_folder, run_jobs, write_manifest
 from wiw.training.navigation_recording import HFOV_DEG, NavigationCollection, read_collection, record_segment
 from wiw.training.traversal import Traversal, plan_scene
 
@@ -82,7 +92,7 @@ def collect_navigation(
         BackendError: the requested renderer does not work here.
         DependencyError: pyarrow is not installed.
         ArgumentError: an option is unknown or out of range, a scene is of a val or test split, or the folder holds a
-            different collection.
+            different collection, or one of scenes whose files have changed.
         FileError: a scene is missing, or the folder cannot be written.
         InfrastructureError: scenes cannot be opened, or a worker process has died.
     """
@@ -92,24 +102,73 @@ def collect_navigation(
     if workers < 1:
         raise ArgumentError(f"collect: expected 1 worker or more, got {workers}")
     folder, specs = Path(out), resolve_train_scenes(scenes)
-    config = {"what": "navigation", "wiw": wiw.__version__, "scenes": list(specs), **options.describe()}
-    open_folder(folder, config, read_navigation_manifest)
+    config: dict[str, Any] = {"what": "navigation", "wiw": wiw.__version__, "scenes": list(specs)}
+    config |= {"sources": digest_scenes(specs), **options.describe()}
     jobs = [
         SceneJob(number * options.passes + index, name, spec, index, folder, options)
         for number, (name, spec) in enumerate(specs.items())
         for index in range(options.passes)
     ]
+    open_folder(folder, config, partial(_read_manifest, config=config, jobs=jobs))
     finished = {job.number: record for job in jobs if (record := job.read_record()) is not None}
     records, errors = _record_passes(jobs, finished, workers, place, progress)
-    if errors and not skip_errors:
+    if errors and not (skip_errors and len(errors) < len(specs)):
+        raise _build_scene_error(errors, len(specs))
+    if not any(record["segments"] for record in records.values()):
         raise InfrastructureError(
-            f"collect: {len(errors)} of {len(specs)} scenes cannot be recorded, the others are: "
-            + "; ".join(f"{scene}: {error}" for scene, error in errors.items())
-            + ". Fix them and repeat the command, or skip them with --skip-errors"
+            f"collect: expected a frame of one scene at least, got none of {', '.join([*specs][:3])}: nothing of their "
+            "floor leads from one waypoint to another. Choose other scenes, or lower --rule spacing"
         )
     if len(finished) < len(jobs) or not _is_described(folder):
         _finish(folder, config, options, [records[number] for number in sorted(records)], errors)
     return NavigationData(folder)
+
+
+def _build_scene_error(errors: Mapping[str, str], total: int) -> InfrastructureError:
+    """Return the error that some scenes, or all, cannot be recorded.
+
+    Args:
+        errors: by the names of the scenes.
+        total: number of scenes that were requested.
+    """
+    some = len(errors) < total
+    return InfrastructureError(
+        f"collect: {len(errors)} of {total} scenes cannot be recorded{', the others are' if some else ''}: "
+        + "; ".join(f"{scene}: {error}" for scene, error in errors.items())
+        + f". Fix them and repeat the command, or {'skip them with --skip-errors' if some else 'choose others'}"
+    )
+
+
+def _read_manifest(folder: Path, config: Mapping[str, Any], jobs: Sequence[SceneJob]) -> dict[str, Any]:
+    """Return the manifest of a folder, with the present digests of scenes where they may be these.
+
+    Scenes of which nothing is recorded may have changed: one that could not be opened is mended so.
+
+    Raises:
+        FileError: there is no manifest, or it cannot be written.
+        ArgumentError: a scene has changed since something of it was recorded, or may have.
+    """
+    found = read_navigation_manifest(folder)
+    present = {**found, "sources": config["sources"]}
+    if present == config and found != config:
+        _require_same_content(folder, found, config["sources"], {job.scene for job in jobs if job.has_begun()})
+        write_manifest(folder, config)
+    return present
+
+
+def _require_same_content(
+    folder: Path, manifest: Mapping[str, Any], sources: Mapping[str, str], begun: AbstractSet[str]
+) -> None:
+    """Check that scenes of which something is recorded are as they were then; they are known by their digests."""
+    known = manifest.get("sources", {})
+    others = [name for name, digest in sources.items() if name in begun and known.get(name) != digest]
+    if others:
+        why = "have changed since" if "sources" in manifest else "may have changed since, as it has no digests of them"
+        names = ", ".join(others[:3]) + (" and others" if others[3:] else "")
+        raise ArgumentError(
+            f"{folder} holds a different collection: the files of {names} {why}; "
+            "repeat the command with the files that it was started with, or choose another folder with --out"
+        )
 
 
 def _record_passes(
@@ -181,6 +240,10 @@ class SceneJob:
         except (OSError, ValueError, KeyError, TypeError):
             return None
         return record if all(sizes) else None
+
+    def has_begun(self) -> bool:
+        """Return whether anything of the pass is recorded."""
+        return self._record_path.exists() or self._part(0).parent.exists()
 
     def run(self) -> dict[str, Any]:
         """Record the pass; return what is known about it, or an "error" where the scene cannot be opened."""
@@ -308,9 +371,10 @@ class _Tally:
 
 
 def _is_described(folder: Path) -> bool:
-    """Return whether the dataset has its description, and the list of segments that this describes."""
+    """Return whether the dataset has its card, its description, and the list of segments that this describes."""
     try:
-        return bool(read_meta(folder)["files"][SEGMENTS] == describe_file(folder / SEGMENTS, 0))
+        listed = read_meta(folder)["files"][SEGMENTS] == describe_file(folder / SEGMENTS, 0)
+        return bool(listed and (folder / CARD).is_file())
     except (FileError, OSError, KeyError):
         return False
 

@@ -46,17 +46,22 @@ Arrays = Mapping[str, NDArray[Any]]
 
 
 def require_held_out(specs: str, val: str) -> None:
-    """Check that no scene is both trained and evaluated on, whatever its path or the edits of an apartment.
+    """Check that no scene is both trained and evaluated on, whatever path or link leads to it, or an apartment's edits.
 
     Raises:
         ArgumentError: names a scene that is in both.
     """
-    trained = {scenes.strip_edits(scenes.absolute(name)) for name in scenes.resolve(specs)}
-    shared = next((name for name in scenes.resolve(val) if scenes.strip_edits(scenes.absolute(name)) in trained), None)
+    trained = {_identify(name) for name in scenes.resolve(specs)}
+    shared = next((name for name in scenes.resolve(val) if _identify(name) in trained), None)
     if shared is not None:
         raise ArgumentError(
             f"--val: expected held-out scenes that are not among --scenes, got {shared} in both; choose others"
         )
+
+
+def _identify(name: str) -> str:
+    """Return what two names of one single scene have in common: the apartment without edits, or the file itself."""
+    return scenes.strip_edits(name) if scenes.is_generated(name) else str(Path(name).expanduser().resolve())
 
 
 @dataclass(frozen=True)

@@ -102,8 +102,7 @@ def open_folder(folder: Path, config: Mapping[str, Any], read: Callable[[Path], 
         folder.mkdir(parents=True, exist_ok=True)
         remove_abandoned_drafts(folder)
         if not any(folder.iterdir()):
-            with atomic_file(folder / MANIFEST) as draft:
-                draft.write_text(json.dumps(config, indent=2) + "\n")
+            write_manifest(folder, config)
     except OSError as error:
         raise FileError(
             f"{folder}: cannot be written ({error.strerror}); expected a writable folder with free space: make room, "
@@ -115,3 +114,13 @@ def open_folder(folder: Path, config: Mapping[str, Any], read: Callable[[Path], 
         raise ArgumentError(
             f"{folder} holds a different collection: {said}; repeat the same command, or choose another with --out"
         )
+
+
+def write_manifest(folder: Path, config: Mapping[str, Any]) -> None:
+    """Write what is requested of a collection into its folder.
+
+    Raises:
+        FileError: it cannot be written.
+    """
+    with atomic_file(folder / MANIFEST) as draft:
+        draft.write_text(json.dumps(config, indent=2) + "\n")

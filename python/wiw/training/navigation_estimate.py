@@ -15,6 +15,7 @@ import numpy as np
 
 from wiw.datasets.navigation_files import FrameFile
 from wiw.datasets.worlds import World, world
+from wiw.errors import BackendError, Error, InfrastructureError
 from wiw.nav import Ground, NavMesh
 from wiw.render import Renderer
 from wiw.scenes import apartment, is_generated, open_outline
@@ -53,6 +54,8 @@ class Estimate:
     planning_hours: float
     recording_hours: float
     """For rendering, encoding and writing the pictures."""
+    left_out: Mapping[str, str]
+    """Why planned scenes cannot be opened, by name; they are not in any number."""
 
     @property
     def core_hours(self) -> float:
@@ -77,6 +80,7 @@ def estimate_collection(
     *,
     preset: str = "default",
     rules: Mapping[str, object] | None = None,
+    skip_errors: bool = False,
     progress: Callable[[str, int, int], None] | None = None,
     **asked: Any,
 ) -> Estimate:
@@ -86,25 +90,45 @@ def estimate_collection(
         scenes: as in `wiw.collect_navigation`.
         preset: likewise.
         rules: likewise.
+        skip_errors: likewise; scenes that are not among those planned count as if they could be opened.
         progress: called with a scene, the number of planned scenes and of how many.
         **asked: likewise.
 
     Raises:
-        Error: as `wiw.collect_navigation`.
+        Error: as `wiw.collect_navigation`; InfrastructureError where planned scenes cannot be opened, with all of them.
     """
     options = read_collection(preset, rules, asked)
     specs = list(resolve_train_scenes(scenes).items())
     chosen = _spread(specs, PLANNED_SCENES)
     recorded = _spread(chosen, RECORDED_SCENES)
-    cost, plans = _Cost(), []
+    cost, plans = _Cost(), dict[str, list[Traversal]]()
+    errors: dict[str, str] = {}
     for done, (name, spec) in enumerate(chosen, 1):
-        plans.append(_plan(name, spec, options, cost))
+        try:
+            plans[name] = _plan(name, spec, options, cost)
+        except BackendError:
+            raise
+        except Error as error:
+            errors[name] = str(error)
         if progress is not None:
             progress(name, done, len(chosen))
-    for (name, spec), traversals in zip(chosen, plans, strict=True):
-        if (name, spec) in recorded:
-            _record_sample(name, spec, traversals, options, cost)
-    return _extrapolate(plans, cost, [spec for _, spec in specs], options)
+    if errors and not (skip_errors and plans):
+        raise _build_scene_error(errors, len(chosen))
+    for name, spec in recorded:
+        if name in plans:
+            _record_sample(name, spec, plans[name], options, cost)
+    left = [spec for name, spec in specs if name not in errors]
+    return _extrapolate([*plans.values()], cost, left, options, errors)
+
+
+def _build_scene_error(errors: Mapping[str, str], planned: int) -> InfrastructureError:
+    """Return the error that some of the planned scenes, or all, cannot be opened, by their names."""
+    remedy = "leave them out with --skip-errors" if len(errors) < planned else "choose others"
+    return InfrastructureError(
+        f"collect: {len(errors)} of {planned} scenes that were planned cannot be opened: "
+        + "; ".join(f"{scene}: {error}" for scene, error in errors.items())
+        + f". Fix them, or {remedy}"
+    )
 
 
 def _spread(specs: Sequence[tuple[str, str]], count: int) -> list[tuple[str, str]]:
@@ -202,7 +226,11 @@ def _record_sample(
 
 
 def _extrapolate(
-    plans: Sequence[Sequence[Traversal]], cost: _Cost, specs: Sequence[str], options: NavigationCollection
+    plans: Sequence[Sequence[Traversal]],
+    cost: _Cost,
+    specs: Sequence[str],
+    options: NavigationCollection,
+    left_out: Mapping[str, str],
 ) -> Estimate:
     scenes, factor = len(specs), len(specs) / len(plans) * options.passes
     traversals = [each for plan in plans for each in plan]
@@ -226,4 +254,5 @@ def _extrapolate(
         opening_hours=cost.estimate_opening(specs) / 3600,
         planning_hours=factor * sum(cost.planning) / 3600,
         recording_hours=pictures * _divide(cost.recording, cost.pictures) / 3600,
+        left_out=left_out,
     )

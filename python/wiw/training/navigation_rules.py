@@ -4,11 +4,11 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass, fields
+from dataclasses import dataclass
 from typing import Literal, get_args
 
 from wiw.errors import ArgumentError
-from wiw.suggestions import did_you_mean
+from wiw.typed_values import read_values
 
 NextWaypoint = Literal["nearest", "2m"]
 
@@ -53,16 +53,16 @@ class NavigationRules:
             if not 0 < getattr(self, name) < float("inf"):
                 raise ArgumentError(f"collect: expected {name} above 0, got {getattr(self, name)}")
         for name in ("mean_weight", "min_island_area"):
-            if getattr(self, name) < 0:
-                raise ArgumentError(f"collect: expected {name} of 0 or more, got {getattr(self, name)}")
+            if not 0 <= getattr(self, name) < float("inf"):
+                raise ArgumentError(f"collect: expected a finite {name} of 0 or more, got {getattr(self, name)}")
         if not 11.25 <= self.turn_threshold_deg <= 45:
             raise ArgumentError(
                 f"collect: expected a turn_threshold_deg from 11.25 to 45, got {self.turn_threshold_deg}"
             )
-        if self.visited_radius <= self.goal_radius:
+        if not self.goal_radius < self.visited_radius < float("inf"):
             raise ArgumentError(
-                f"collect: expected a visited_radius above goal_radius ({self.goal_radius} m), or a reached waypoint "
-                f"would never count as visited; got {self.visited_radius} m"
+                f"collect: expected a finite visited_radius above goal_radius ({self.goal_radius} m), or a reached "
+                f"waypoint would never count as visited; got {self.visited_radius} m"
             )
         if self.max_segment_frames < 2 or self.max_scene_frames < 2:
             raise ArgumentError(
@@ -83,14 +83,9 @@ def make_rules(preset: str = "default", options: Mapping[str, object] | None = N
     """Return the rules of a preset with some of them replaced.
 
     Raises:
-        ArgumentError: no preset, or no rule, has such a name; or a number is out of range.
+        ArgumentError: no preset, or no rule, has such a name; or a value is of another type or out of range.
     """
     if preset not in PRESETS:
         raise ArgumentError(f"collect: expected a preset among {', '.join(PRESETS)}, got {preset}")
-    names = [field.name for field in fields(NavigationRules)]
-    for name in options or {}:
-        if name not in names:
-            raise ArgumentError(
-                f"collect: unknown rule {name}; expected {', '.join(names)}.{did_you_mean(name, names)}"
-            )
-    return NavigationRules(**{**vars(PRESETS[preset]), **(options or {})})
+    given = read_values(NavigationRules, options or {}, "collect", "rule")
+    return NavigationRules(**{**vars(PRESETS[preset]), **given})

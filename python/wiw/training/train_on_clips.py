@@ -26,7 +26,8 @@ from wiw.training.post_training.clip_trainer import arrange_clips
 from wiw.training.post_training.corpora import NavigationCorpus, require_panoramas, require_training_split
 from wiw.training.post_training.recipe import ClipRecipe
 from wiw.training.post_training.stop_signals import SignalledCheckpoint
-from wiw.training.post_training.train import train_and_validate
+from wiw.training.post_training.train import locate_log, train_and_validate
+from wiw.training.post_training.training_log import require_own_log
 from wiw.training.post_training.validation import (
     CARD,
     OnValidation,
@@ -35,12 +36,14 @@ from wiw.training.post_training.validation import (
     find_held_out,
 )
 from wiw.training.reduced_frames import Bar, reduce_frames
+from wiw.training.save_signal import hold_save_signal
 from wiw.types import Conditioning
 
 BEST = "weights.safetensors"
 """Name of the best weights so far, in the log's folder."""
 
 
+@hold_save_signal()
 def train_on_clips(
     name: str,
     data: str | Path,
@@ -87,7 +90,8 @@ def train_on_clips(
     Raises:
         ArgumentError: an unknown model or device; a dataset of perspective views, of scenes for evaluation or, for
             warpnet, without depth; too few clips; a state of a training with other data or numbers; weights in `out`
-            that another training has written; or validation or decisions on scenes that are trained on or not there.
+            that another training has written; files of others in the folder of the log; or validation or decisions on
+            scenes that are trained on or not there.
         TrainingError: the loss is not finite; the last good state is kept, the message names the batch.
         FileError: the dataset is missing, incomplete or damaged, or a file cannot be written.
         DeviceMemoryError: memory does not suffice.
@@ -114,6 +118,7 @@ def train_on_clips(
     card |= {"validated_on": checked.identity if checked else None}
     if out.exists():
         return _read_finished(learner, out, card)
+    require_own_log(locate_log(out), out.name, locate_checkpoint(out).exists())
     frames = reduce_frames(dataset, recipe.clip_size, cache, bar)
     state = SignalledCheckpoint(locate_checkpoint(out), {"model": name, **card}, seconds)
     remedies = f"lower batch (now {recipe.batch}), or choose a smaller size or network"

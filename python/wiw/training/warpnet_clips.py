@@ -42,6 +42,11 @@ class WarpNetClipRecipe(ClipRecipe):
     warmup: float = 0.05
     """Share of the steps in which the learning rate grows from 0; then it falls as a cosine."""
 
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        if self.shift != ClipRecipe.shift:
+            raise ArgumentError(f"recipe: shift: warpnet has no noise levels; leave it out, got {self.shift}")
+
     def scale_rate(self, progress: float) -> float:
         """Return the factor of the learning rate after a share of the steps, 0 to 1."""
         return warmup_cosine_schedule(self.warmup)(progress)

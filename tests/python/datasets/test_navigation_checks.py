@@ -30,7 +30,7 @@ from wiw.datasets.navigation_files import (
 from wiw.datasets.navigation_segment import NavigationSegment, encode_color
 from wiw.datasets.navigation_statistics import compute_statistics
 from wiw.datasets.worlds import world
-from wiw.errors import FileError
+from wiw.errors import FileError, InfrastructureError
 from wiw.scenes import Scene, apartment
 from wiw.training import collect_navigation as collecting
 from wiw.training import navigation_estimate
@@ -270,6 +270,25 @@ def test_a_scene_without_floor_is_estimated(two_rooms: str, monkeypatch: pytest.
     assert (found.frames, found.pictures, found.coverage, found.gigabytes, found.recording_hours) == (0, 0, 0, 0, 0)
 
 
+def test_an_estimate_names_the_scenes_that_cannot_be_opened(
+    two_rooms: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    bad = tmp_path / "bad.obj"
+    bad.write_text("v 0 0 0\n")
+    with pytest.raises(InfrastructureError, match=r"1 of 2 scenes that were planned .*: bad: .*--skip-errors"):
+        estimate_collection([str(bad), two_rooms], **SMALL)
+    with pytest.raises(InfrastructureError, match=r"1 of 1 scenes that were planned .*: bad: .*choose others"):
+        estimate_collection(str(bad), skip_errors=True, **SMALL)
+    found = estimate_collection([str(bad), two_rooms], skip_errors=True, **SMALL)
+    alone = estimate_collection(two_rooms, **SMALL)
+    assert list(found.left_out) == ["bad"] and not alone.left_out
+    assert (found.scenes, found.planned_scenes, found.frames) == (1, 1, alone.frames)
+    rules = [word for name, value in RULES.items() for word in ("--rule", f"{name}={value}")]
+    asked = ["collect", "navigation", "--scenes", str(bad), two_rooms, "--size", "36", "64", "--dry-run", *rules]
+    assert main([*asked, "--backend", "cpu", "--skip-errors"]) == 0
+    assert "skipped   bad: " in capsys.readouterr().out
+
+
 SQUARE = [[0, 0, 4, 0], [4, 0, 4, 4], [4, 4, 0, 4], [0, 4, 0, 0]]
 HOLE = [[1.5, 1, 2.5, 1], [2.5, 1, 2.5, 3], [2.5, 3, 1.5, 3], [1.5, 3, 1.5, 1]]
 
@@ -337,6 +356,7 @@ def test_the_command_line(tmp_path: Path, two_rooms: str, capsys: pytest.Capture
         (["collect", "navigation", "--scenes", "apartments:val:2"], "expected scenes of a train split"),
         (["collect", "navigation", "--rule", "spacin=2"], "spacin"),
         (["collect", "navigation", "--rule", "spacing=-2"], "spacing above 0"),
+        (["collect", "navigation", "--rule", "spacing=2m"], "spacing: expected a number, got '2m'"),
         (["data", "stats", "nowhere"], "meta.json does not exist"),
         (["data", "verify", "nowhere"], "meta.json does not exist"),
         (["data", "show", "nowhere"], "meta.json does not exist"),

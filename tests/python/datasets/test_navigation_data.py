@@ -274,6 +274,22 @@ def test_parts_share_no_scene_and_scenes_stay_where_they_are(collected: Path) ->
         NavigationData(collected, "val")  # type: ignore[arg-type]
 
 
+def test_other_scenes_of_its_file_name_leave_a_scene_in_its_part(
+    collected: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def list_held_out(*names: str) -> list[str]:
+        rows = [{"scene": name} for name in names]
+        monkeypatch.setattr("wiw.datasets.navigation.read_segment_list", lambda path: rows)
+        return [row["scene"] for row in NavigationData(collected, "held-out", held_out=0.5).segments]
+
+    names = [f"house{number}" for number in range(20)]
+    held_out = list_held_out(*names)
+    assert 0 < len(held_out) < len(names)
+    renamed = list_held_out(*(f"{folder}/{name}" for name in names for folder in "ab"))
+    assert renamed == [f"{folder}/{name}" for name in held_out for folder in "ab"]
+    assert list_held_out(*(f"{name}.v1" for name in names)) == [f"{name}.v1" for name in held_out]
+
+
 def test_an_edited_apartment_is_in_the_part_of_the_one_that_it_is_a_copy_of(
     collected: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -376,6 +392,13 @@ def test_a_finished_dataset_is_left_alone_and_a_lost_file_is_made_anew(
     assert kept.stat().st_mtime_ns == times[kept]
 
 
+def test_a_lost_card_is_made_anew(collected: Path, tmp_path: Path, two_rooms: str) -> None:
+    shutil.copytree(collected, tmp_path, dirs_exist_ok=True)
+    (tmp_path / "README.md").unlink()
+    collect_navigation(tmp_path, two_rooms, passes=2, lossless=True, **SMALL)
+    assert contents(tmp_path) == contents(collected)
+
+
 @pytest.mark.parametrize("damage", ["missing", "cut", "flipped"])
 def test_a_lost_list_of_segments_is_made_anew(damage: str, collected: Path, tmp_path: Path, two_rooms: str) -> None:
     shutil.copytree(collected, tmp_path, dirs_exist_ok=True)
@@ -463,6 +486,18 @@ def test_files_below_a_folder_of_evaluation_are_refused(tmp_path: Path, two_room
 )
 def test_scans_of_evaluation_are_known_by_their_archives_and_numbers(file: str, split: str | None) -> None:
     assert find_evaluation_split(f"/data/{file}") == split
+
+
+def test_scans_of_evaluation_are_known_through_links(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    (scan,) = write_scenes(tmp_path, "hm3d/00800-TEEsavR23oF/TEEsavR23oF.basis.glb")
+    (house,) = write_scenes(tmp_path, "val/homes/house.glb")
+    for link, target in {"a.glb": scan, "b.glb": house, "folder": f"{tmp_path}/val/homes", "val/out.glb": "/x"}.items():
+        (tmp_path / link).symlink_to(target)
+    monkeypatch.chdir(tmp_path)
+    given = ["a.glb", "b.glb", "folder/house.glb", "hm3d/00800-TEEsavR23oF/x/../TEEsavR23oF.basis.glb", "val/out.glb"]
+    assert [find_evaluation_split(each) for each in given] == ["val"] * len(given)
+    assert find_evaluation_split("val/../train/house.glb") is None
+    assert find_shared_scene(["a.glb"], ["TEEsavR23oF"]) == "a.glb" and find_shared_scene(["a.glb"], ["house"]) is None
 
 
 def write_scenes(folder: Path, *names: str) -> list[str]:
@@ -574,6 +609,81 @@ def test_another_collection_is_not_mixed_in(collected: Path, tmp_path: Path, two
     (tmp_path / "manifest.json").unlink()
     with pytest.raises(FileError, match="expected a new folder"):
         collect_navigation(tmp_path, two_rooms, **SMALL)
+
+
+@pytest.fixture
+def own_scene(tmp_path: Path, two_rooms: str) -> Path:
+    """A copy of the scene, with its materials."""
+    for ending in (".obj", ".mtl"):
+        shutil.copy(Path(two_rooms).with_suffix(ending), tmp_path)
+    return tmp_path / Path(two_rooms).name
+
+
+@pytest.mark.parametrize("edited", [".obj", ".mtl"])
+@pytest.mark.parametrize("kept", ["all", "parts"])
+def test_a_scene_that_has_changed_is_not_mixed_in(
+    edited: str, kept: str, collected: Path, tmp_path: Path, own_scene: Path
+) -> None:
+    """Whether the dataset is finished or a first segment is recorded; the scene's own path does not matter."""
+    out = tmp_path / "out"
+    shutil.copytree(collected, out)
+    before = contents(out)
+    collect_navigation(out, own_scene, passes=2, lossless=True, **SMALL)
+    assert contents(out) == before
+    if kept == "parts":
+        shutil.rmtree(out / "scenes")
+        (out / "parts/00001").mkdir(parents=True)
+    with own_scene.with_suffix(edited).open("a") as file:
+        file.write("# another\n")
+    before = contents(out)
+    with pytest.raises(
+        ArgumentError, match=r"different collection: the files of two_rooms have changed since; repeat .*--out"
+    ):
+        collect_navigation(out, own_scene, passes=2, lossless=True, **SMALL)
+    assert contents(out) == before
+
+
+def test_a_folder_without_digests_of_its_scenes_is_read_but_not_continued(
+    collected: Path, tmp_path: Path, two_rooms: str
+) -> None:
+    shutil.copytree(collected, tmp_path, dirs_exist_ok=True)
+    for name, path in (("manifest.json", []), ("meta.json", ["config"])):
+        content = part = json.loads((tmp_path / name).read_text())
+        for key in path:
+            part = part[key]
+        del part["sources"]
+        (tmp_path / name).write_text(json.dumps(content))
+    assert len(NavigationData(tmp_path)[:]) == len(NavigationData(collected))
+    with pytest.raises(ArgumentError, match="two_rooms may have changed since, as it has no digests of them"):
+        collect_navigation(tmp_path, two_rooms, passes=2, lossless=True, **SMALL)
+    shutil.rmtree(tmp_path / "scenes")
+    collect_navigation(tmp_path, two_rooms, passes=2, lossless=True, **SMALL)
+    assert contents(tmp_path) == contents(collected)
+
+
+def test_a_scene_that_could_not_be_opened_may_be_mended(tmp_path: Path, own_scene: Path) -> None:
+    bad, out, few = tmp_path / "bad.obj", tmp_path / "out", {**SMALL, "rules": {**RULES, "max_scene_frames": 10}}
+    bad.write_text("v 0 0 0\n")
+    with pytest.raises(InfrastructureError, match="1 of 2 scenes"):
+        collect_navigation(out, [bad, own_scene], **few)
+    shutil.copy(own_scene, bad)
+    assert collect_navigation(out, [bad, own_scene], **few).scenes == {"bad", "two_rooms"}
+    before = contents(out)
+    assert collect_navigation(out, [bad, own_scene], **few).meta["left_out"] == {} and contents(out) == before
+
+
+@pytest.mark.parametrize("skip_errors", [False, True])
+def test_no_dataset_is_made_of_nothing(skip_errors: bool, tmp_path: Path, two_rooms: str) -> None:
+    bad = [tmp_path / f"bad{number}.obj" for number in range(2)]
+    for file in bad:
+        file.write_text("v 0 0 0\n")
+    with pytest.raises(InfrastructureError, match=r"2 of 2 scenes cannot be recorded: bad0: .*; bad1: .*choose others"):
+        collect_navigation(tmp_path / "out", bad, skip_errors=skip_errors, **SMALL)
+    far = {**SMALL, "rules": {**RULES, "spacing": 1000.0}}
+    with pytest.raises(InfrastructureError, match=r"a frame of one scene at least, got none of two_rooms"):
+        collect_navigation(tmp_path / "far", two_rooms, skip_errors=skip_errors, **far)
+    for out in ("out", "far"):
+        assert not {"meta.json", "README.md", "segments.parquet"} & {path.name for path in (tmp_path / out).iterdir()}
 
 
 def test_a_scene_that_cannot_be_opened_stops_no_other(tmp_path: Path, two_rooms: str) -> None:

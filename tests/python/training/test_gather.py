@@ -13,8 +13,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from wiw.errors import FileError, InfrastructureError
-from wiw.training.gather import Arrays, Job, gather_arrays
+from wiw.errors import ArgumentError, FileError, InfrastructureError
+from wiw.training.gather import Arrays, Job, gather_arrays, require_held_out
 
 SOURCES = {name: name for name in "abcd"}
 SCRIPT = """
@@ -47,6 +47,23 @@ def gather(folder: Path, workers: int, *more: str) -> list[int]:
     sources = SOURCES | {name: name for name in more}
     found = gather_arrays(sources, job, folder, workers, lambda items, text, total: items)
     return [int(arrays["name"][0]) for arrays in found]
+
+
+def test_no_scene_is_trained_and_measured_on_by_another_path(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.chdir(tmp_path)
+    for name in ("a/house.obj", "b/house.obj"):
+        Path(name).parent.mkdir()
+        Path(name).write_text("")
+    Path("link.obj").symlink_to("a/house.obj")
+    Path("folder").symlink_to("a")
+    for other in ("link.obj", "folder/house.obj", "b/../a/house.obj", str(tmp_path / "a/house.obj")):
+        with pytest.raises(ArgumentError, match=f"got {other} in both"):
+            require_held_out("a/house.obj", other)
+        with pytest.raises(ArgumentError, match=r"got a/house\.obj in both"):
+            require_held_out(other, "a/house.obj")
+    with pytest.raises(ArgumentError, match="remove:tv_1 in both"):
+        require_held_out("apartments:train:3", "apartments:train/2?remove:tv_1")
+    require_held_out("a/house.obj", "b/house.obj")
 
 
 @pytest.mark.nightly

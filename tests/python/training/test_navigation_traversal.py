@@ -331,6 +331,7 @@ def test_presets_differ_in_the_visited_radius_alone() -> None:
     assert {name for name in default if default[name] != paper[name]} == {"visited_radius"}
     assert (default["visited_radius"], paper["visited_radius"], paper["spacing"]) == (0.5, 3.0, 3.0)
     assert make_rules("paper", {"spacing": 2.0}) == NavigationRules(spacing=2.0, visited_radius=3.0)
+    assert make_rules("default", {"spacing": "2e1"}) == NavigationRules(spacing=20.0), "text, to YAML"
 
 
 @pytest.mark.parametrize(
@@ -341,8 +342,19 @@ def test_presets_differ_in_the_visited_radius_alone() -> None:
         ({"mean_weight": -1.0}, "mean_weight"),
         ({"visited_radius": 0.2}, "visited_radius above goal_radius"),
         ({"max_segment_frames": 1}, "2 or more"),
-        ({"next_waypoint": "far"}, "among nearest, 2m, got far"),
-        ({"spacin": 1.0}, "unknown rule spacin.*Did you mean spacing"),
+        ({"mean_weight": math.nan}, "finite mean_weight"),
+        ({"min_island_area": math.inf}, "finite min_island_area"),
+        ({"visited_radius": math.nan}, "finite visited_radius"),
+        ({"turn_threshold_deg": math.nan}, "turn_threshold_deg from 11.25"),
+        ({"spacing": "1e999"}, "spacing above 0"),
+        ({"next_waypoint": "far"}, "next_waypoint: expected one of nearest, 2m, got 'far'"),
+        ({"spacin": 1.0}, "unknown rule 'spacin'.*Did you mean spacing"),
+        ({"spacing": "2m"}, "collect: spacing: expected a number, got '2m'"),
+        ({"density": "abc"}, "density: expected a number"),
+        ({"density": None}, "density: expected a number, got None"),
+        ({"spacing": True}, "spacing: expected a number, got True"),
+        ({"min_samples": 1.5}, "min_samples: expected a whole number"),
+        ({"max_scene_frames": 30.5}, "max_scene_frames: expected a whole number"),
     ],
 )
 def test_rules_that_cannot_be_are_refused(options: dict[str, Any], words: str) -> None:

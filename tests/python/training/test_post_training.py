@@ -5,11 +5,14 @@ from __future__ import annotations
 
 import io
 import json
+import math
 import os
 import re
 import shlex
 import shutil
 import signal
+import subprocess
+import sys
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
@@ -36,6 +39,7 @@ import torch
 from folders import contents
 from post_training_parts import (
     make_trainer,
+    read_log,
     run_in_a_process,
     save_dataset,
     save_stock,
@@ -45,7 +49,7 @@ from post_training_parts import (
 )
 
 import tiny_pipelines
-from wiw.training.post_training import svd
+from wiw.training.post_training import svd, train
 from wiw.training.post_training.clip_order import ClipOrder
 from wiw.training.post_training.clips import load_clips
 from wiw.training.post_training.conditioned_generator import add_lora
@@ -424,6 +428,78 @@ def test_sigusr1_writes_the_state_and_goes_on(data: Path, weights: Any, tmp_path
     assert found == [2, 2] and signal.getsignal(signal.SIGUSR1) == before
 
 
+def test_sigusr1_before_the_first_step_is_kept_for_it_and_after_the_last_does_nothing(
+    data: Path, weights: Any, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    found: list[int] = []
+    state = tmp_path / "out.checkpoint"
+    fit, publish = VideoFamily.fit, train.publish_checkpoint
+
+    def send(function: Any) -> Any:
+        return lambda *given: (os.kill(os.getpid(), signal.SIGUSR1), function(*given))[1]
+
+    def on_step(step: int, steps: int, loss: float) -> None:
+        if state.exists():
+            found.append(torch.load(state, weights_only=True)["step"])
+
+    monkeypatch.setattr(VideoFamily, "fit", send(fit))
+    monkeypatch.setattr(train, "publish_checkpoint", send(publish))
+    options: dict[str, Any] = {"weights": weights("ltx-action"), "device": "cpu", "part": "all"}
+    recipe = tiny_recipe("ltx-action", epochs=3)
+    before = signal.getsignal(signal.SIGUSR1)
+    post_train("ltx-action", data, tmp_path / "out", recipe=recipe, on_step=on_step, **options)
+    assert found == [1, 1] and (tmp_path / "out/training.json").exists() and not state.exists()
+    assert signal.getsignal(signal.SIGUSR1) == before
+
+
+@pytest.mark.parametrize("name", ["ltx-action", "pocket"])
+def test_sigusr1_does_not_end_a_command_that_has_no_step_yet(name: str, tmp_path: Path) -> None:
+    """It comes while the command looks for its data."""
+    code = (
+        "import os, signal, sys, importlib\n"
+        "from wiw.cli.train import corpus\n"
+        f"module = importlib.import_module('wiw.cli.train.{'pocket' if name == 'pocket' else 'video'}')\n"
+        "require = corpus.require_data\n"
+        "module.require_data = lambda *given: (os.kill(os.getpid(), signal.SIGUSR1), require(*given))[1]\n"
+        "from wiw.cli import main\n"
+        "sys.exit(main(sys.argv[1:]))\n"
+    )
+    command = ["train", name, "--data", str(tmp_path / "nowhere"), "--out", str(tmp_path / "out")]
+    done = subprocess.run([sys.executable, "-c", code, *command], capture_output=True, text=True, check=False)
+    assert done.returncode == 2 and "nowhere" in done.stderr
+
+
+@pytest.mark.parametrize("kept", ["notes.txt", "best/weights", "out/mine.txt", "step-1.png"])
+def test_a_folder_of_others_in_the_place_of_the_log_is_left_alone(kept: str, data: Path, tmp_path: Path) -> None:
+    path = tmp_path / "out.log" / kept
+    path.parent.mkdir(parents=True)
+    path.write_text("mine")
+    options: dict[str, Any] = {"recipe": tiny_recipe("ltx-action"), "weights": tmp_path / "nowhere", "device": "cpu"}
+    said = rf"out\.log: expected a folder for the log, .* has {re.escape(Path(kept).parts[0])}; "
+    with pytest.raises(ArgumentError, match=said):
+        post_train("ltx-action", data, tmp_path / "out", **options)
+    assert path.read_text() == "mine"
+    (tmp_path / "file.log").write_text("mine")
+    with pytest.raises(ArgumentError, match=r"file\.log: expected a folder for the log, .* got a file"):
+        post_train("ltx-action", data, tmp_path / "file", **options)
+
+
+def test_the_log_of_a_training_of_before_begins_anew(data: Path, weights: Any, tmp_path: Path) -> None:
+    log = tmp_path / "out.log"
+    for name in (
+        "metrics.jsonl",
+        "step-0000002.png",
+        "best/training.json",
+        "out/events.out.tfevents.1",
+        "out/1/hparams.yml",
+    ):
+        (log / name).parent.mkdir(parents=True, exist_ok=True)
+        (log / name).write_text("{}\n")
+    options: dict[str, Any] = {"weights": weights("ltx-action"), "device": "cpu", "part": "all"}
+    post_train("ltx-action", data, tmp_path / "out", recipe=tiny_recipe("ltx-action", epochs=1), **options)
+    assert [path.name for path in log.iterdir()] == ["metrics.jsonl"] and len(read_log(tmp_path / "out")) == 1
+
+
 def test_a_loss_that_is_not_finite_names_the_batch_and_keeps_the_state(
     data: Path, weights: Any, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -566,6 +642,8 @@ def test_rates_follow_the_schedule() -> None:
         ({"schedule": "step"}, "one of constant, linear, cosine"),
         ({"frames": 1}, "frames: expected 2 or more"),
         ({"drop": 1.0}, "drop: expected a share"),
+        ({"weight_decay": math.nan}, "finite weight_decay of 0 or more, .* got nan"),
+        ({"weight_decay": math.inf}, "finite weight_decay of 0 or more, .* got inf"),
     ],
 )
 def test_recipes_that_make_no_sense_are_refused(options: dict[str, Any], said: str) -> None:

@@ -232,6 +232,88 @@ def test_the_clips_to_encode_are_those_that_a_training_takes(data: Path, monkeyp
     assert [(row["clip"], row["mirrored"]) for row in rows] == [(row, side) for row in sorted(seen) for side in (0, 1)]
 
 
+@pytest.mark.parametrize(
+    ("name", "asked", "fitted"),
+    [
+        ("ltx-action", (10, (60, 120)), (17, (64, 128))),
+        ("ltx-action", (9, (64, 128)), (9, (64, 128))),
+        ("wan2.1-action", (6, (40, 64)), (9, (32, 64))),
+        ("wan2.2-5b-action", (5, (40, 64)), (5, (32, 64))),
+        ("svd-action", (3, (33, 63)), (3, (32, 64))),
+        ("cosmos-predict2-action", (4, (24, 60)), (5, (32, 64))),
+        ("ltx-action", (9, None), (9, (576, 1024))),
+    ],
+)
+def test_clips_have_the_shape_that_the_model_takes_before_it_is_loaded(
+    name: str, asked: tuple[Any, ...], fitted: tuple[Any, ...], data: Path, weights: Any
+) -> None:
+    family, corpus = find_family(name), open_corpus(data, "all")
+    _, recipe = family.fit(corpus, replace(tiny_recipe(name), frames=asked[0], size=asked[1]))
+    assert (recipe.frames, recipe.size) == fitted
+    loaded = family.load(corpus, recipe, PretrainedWeights(str(weights(name)), device="cpu"))
+    assert loaded.recipe == recipe
+
+
+def test_clips_encoded_ahead_are_those_of_a_training_whose_frames_are_rounded(
+    data: Path, weights: Any, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+) -> None:
+    name, cache = "ltx-action", tmp_path / "cache"
+    recipe = tiny_recipe(name, frames=4, size=(30, 64), epochs=1)
+    options: dict[str, Any] = {"weights": weights(name), "device": "cpu", "recipe": recipe, "part": "all"}
+    count = encode_clips.encode_clips(name, data, cache, **options)
+    said = "ltx-action takes other shapes; it is trained with frames=9 in place of 4 and size=[32, 64] in place of"
+    assert [each for each in caplog.messages if "shape" in each] == [f"{said} [30, 64]"]
+    files = sorted(cache.rglob("*.safetensors"))
+    assert count == len(files) == 4
+    caplog.clear()
+    monkeypatch.setattr("wiw.training.post_training.trainer.load_clip", None)
+    card = post_train(name, data, tmp_path / "out", cache=cache, **options)
+    assert (card["recipe"]["frames"], card["recipe"]["size"]) == (9, [32, 64]) and len(caplog.messages) == 1
+    assert sorted(cache.rglob("*.safetensors")) == files
+
+
+def test_clips_are_counted_as_the_model_takes_them_before_it_is_loaded(data: Path, tmp_path: Path) -> None:
+    """Segments have 12 frames: enough for the 10 that are asked for, too few for the 17 that the model takes."""
+    recipe, nowhere = tiny_recipe("ltx-action", frames=10), tmp_path / "nowhere"
+    with pytest.raises(ArgumentError, match="no segment has 17 frames"):
+        post_train("ltx-action", data, tmp_path / "out", recipe=recipe, weights=nowhere, device="cpu", part="all")
+
+
+@pytest.mark.parametrize(
+    ("name", "options", "said"),
+    [
+        ("ltx-action", {"still": 0.5}, "still: ltx-action does not read it; leave it out, got 0.5"),
+        ("svd-action", {"shift": 3.0}, "shift: svd-action does not read it"),
+        ("cosmos-predict2-action", {"shift": 5.0}, "shift: cosmos-predict2-action does not read it"),
+        ("wan2.1-action", {"still": 0.1}, "still: wan2.1-action does not read it"),
+        ("nwm-action", {"shift": 2.0}, "shift: nwm-action does not read it"),
+        ("svd-action", {"drop": 0.34}, "drop: svd-action drops .*expected a third at most, got 0.34"),
+    ],
+)
+def test_options_without_effect_are_refused_before_weights_are_loaded(
+    name: str, options: dict[str, Any], said: str, data: Path, tmp_path: Path
+) -> None:
+    with pytest.raises(ArgumentError, match=said):
+        post_train(name, data, tmp_path / "out", recipe=tiny_recipe(name, **options), weights=tmp_path / "nowhere")
+    assert not list(tmp_path.iterdir())
+    find_family(name).fit(open_corpus(data, "all"), tiny_recipe(name))
+    read = {"svd-action": {"drop": 1 / 3}, "wan2.1-action": {"shift": 2.0}, "nwm-action": {"still": 0.5}}
+    find_family(name).fit(open_corpus(data, "all"), tiny_recipe(name, **read.get(name, {"drop": 0.9})))
+
+
+@pytest.mark.parametrize("place", ["latents", "latents/more/folders"])
+def test_a_cache_in_the_place_of_a_file_is_refused_before_weights_are_loaded(
+    place: str, data: Path, tmp_path: Path
+) -> None:
+    (tmp_path / "latents").write_text("mine")
+    options: dict[str, Any] = {"recipe": tiny_recipe("ltx-action"), "weights": tmp_path / "nowhere", "device": "cpu"}
+    said = r"cache: expected a folder, new or not, got .*: .*latents is a file"
+    with pytest.raises(ArgumentError, match=said):
+        post_train("ltx-action", data, tmp_path / "out", cache=tmp_path / place, **options)
+    with pytest.raises(ArgumentError, match=said):
+        encode_clips.encode_clips("ltx-action", data, tmp_path / place, **options)
+
+
 def test_a_damaged_file_of_the_cache_is_made_anew(data: Path, weights: Any, tmp_path: Path) -> None:
     plain, cached = (make_trainer("nwm-action", data, weights("nwm-action"), epochs=3) for _ in range(2))
     cached._cache = LatentCache(tmp_path, {})

@@ -158,6 +158,27 @@ def test_another_dataset_may_be_validated_on(data: Path, train: Any, tmp_path: P
     assert "validation" not in train(tmp_path / "alone", part="all", numbers={"epochs": 1})
 
 
+@pytest.mark.parametrize("name", ["place/house", "house.v2"])
+def test_a_scene_that_has_another_name_in_the_other_dataset_is_not_validated_on(
+    name: str, train: Any, tmp_path: Path
+) -> None:
+    other = save_dataset(tmp_path / "other", scenes=("attic", name))
+    with pytest.raises(ArgumentError, match=rf"scenes that are not trained on, got {name}; leave them out of .*other"):
+        train(tmp_path / "out", part="all", validation=other)
+
+
+@pytest.mark.parametrize("content", [None, "folder", "{}", "PAR1"])
+def test_what_is_no_file_of_decisions_is_not_to_be_deleted(content: str | None, train: Any, tmp_path: Path) -> None:
+    path = tmp_path / "mine.json"
+    if content == "folder":
+        path.mkdir()
+    elif content is not None:
+        path.write_text(content)
+    with pytest.raises(FileError, match=r"mine\.json.*`wiw collect decisions` writes") as caught:
+        train(tmp_path / "out", decisions=path)
+    assert "delete" not in str(caught.value) and not (tmp_path / "out.log").exists()
+
+
 @pytest.mark.parametrize(
     ("part", "every", "given", "said"),
     [

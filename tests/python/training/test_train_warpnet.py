@@ -207,6 +207,11 @@ def test_the_best_weights_in_validation_are_kept(
     assert WarpNet(out).card == card and card["validation"]["psnr"] == told[card["steps"]]["psnr"]
 
 
+def test_a_shift_of_noise_levels_is_refused_as_there_are_none() -> None:
+    with pytest.raises(ArgumentError, match="shift: warpnet has no noise levels; leave it out, got 3"):
+        replace(clip_recipe(), shift=3.0)
+
+
 def clip_recipe() -> WarpNetClipRecipe:
     options = dict(each.split("=") for each in SMALL)
     return load_recipe(

@@ -9,12 +9,14 @@ from typing import TYPE_CHECKING, Any
 
 from wiw.cli.train.progress import TrainingProgress, track_items
 from wiw.errors import ArgumentError
+from wiw.training.save_signal import hold_save_signal
 
 if TYPE_CHECKING:
     from wiw.datasets.navigation import NavigationData
     from wiw.training.post_training.recipe import ClipRecipe
 
 
+@hold_save_signal()
 def train_and_measure(
     name: str,
     out: Path,

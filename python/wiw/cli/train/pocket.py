@@ -14,6 +14,7 @@ from wiw.cli.train.corpus import TrackerName, describe_steps, require_data
 from wiw.cli.train.on_clips import train_and_measure
 from wiw.cli.train.small_networks import VAL_SCENES, Count, check_counts, check_seed, drop_none, write_weights
 from wiw.training.preparation import Preparation
+from wiw.training.save_signal import hold_save_signal
 
 
 def train_pocket(
@@ -73,9 +74,9 @@ def train_pocket(
     check_counts(epochs=epochs)
     check_seed(seed)
     Pocket.requires.require()
-    from wiw.training.pocket import held_out
+    with hold_save_signal(), write_weights("pocket", out):
+        from wiw.training.pocket import held_out
 
-    with write_weights("pocket", out):
         numbers = drop_none({"epochs": epochs, "seed": seed})
         options = {**numbers, **parse_options(option, PocketRecipe, "--option")}
         chosen = load_recipe("pocket", recipe, options, kind=PocketRecipe)

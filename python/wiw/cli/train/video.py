@@ -21,6 +21,7 @@ from wiw.errors import ArgumentError
 from wiw.networks import resolve_device
 from wiw.ray_cluster import HERE, Engine
 from wiw.training.launcher import ProcessLayout
+from wiw.training.save_signal import hold_save_signal
 
 if TYPE_CHECKING:
     from wiw.training.post_training.recipe import PostTrainingRecipe
@@ -67,18 +68,19 @@ def make_command(name: str) -> Callable[..., int]:
         layout: Annotated[ProcessLayout, arg(name="")] = ONE_PROCESS,
         dry_run: bool = False,
     ) -> int:
-        check_counts(epochs=epochs, workers=workers)
-        check_seed(seed)
-        numbers = drop_none({"epochs": epochs, "seed": seed})
-        parts: dict[str, Any] = {"weights": weights, "device": device, "part": part}
-        if encode_only:
-            unused = {"--out": out, "--validation": validation, "--decisions": decisions, "--tracker": tracker}
-            _require_encoding(unused, layout, dry_run)
-            return _encode(name, data, cache, recipe, option, numbers, parts, workers or 1, place)
-        if workers is not None or place != HERE:
-            raise ArgumentError("train: --workers and --engine are for --encode-only; --gpus is for training")
-        parts |= {"cache": cache, "validation": validation, "decisions": decisions, "tracker": tracker}
-        return _post_train(name, out or Path(name), data, recipe, option, numbers, parts, layout, dry_run)
+        with hold_save_signal():
+            check_counts(epochs=epochs, workers=workers)
+            check_seed(seed)
+            numbers = drop_none({"epochs": epochs, "seed": seed})
+            parts: dict[str, Any] = {"weights": weights, "device": device, "part": part}
+            if encode_only:
+                unused = {"--out": out, "--validation": validation, "--decisions": decisions, "--tracker": tracker}
+                _require_encoding(unused, layout, dry_run)
+                return _encode(name, data, cache, recipe, option, numbers, parts, workers or 1, place)
+            if workers is not None or place != HERE:
+                raise ArgumentError("train: --workers and --engine are for --encode-only; --gpus is for training")
+            parts |= {"cache": cache, "validation": validation, "decisions": decisions, "tracker": tracker}
+            return _post_train(name, out or Path(name), data, recipe, option, numbers, parts, layout, dry_run)
 
     train_video.__doc__ = (
         HELP.replace("TITLE", VIDEO[name])

@@ -50,7 +50,7 @@ class MotionDegradation(Degradation):
         if model.accepts.space == GRIPPER_POSES:
             triples = zip(controls, observations.simulators, seeds, strict=True)
             changed = [
-                replace(own, ids=self._send_gripper(_make_idle(own.ids, bench), int(seed)))
+                replace(own, ids=self._send_gripper(_make_idle(np.asarray(own.ids, np.float64), bench), int(seed)))
                 for own, bench, seed in triples
             ]
             return model.rollout(observations, changed, seeds)

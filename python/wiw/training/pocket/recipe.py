@@ -3,6 +3,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 
 from wiw.errors import ArgumentError
@@ -45,8 +46,9 @@ class PocketRecipe(ClipRecipe):
         self._require_shares("warmup", "decay", "pure_noise")
         if not 0 < self.least_level <= 1:
             raise ArgumentError(f"recipe: least_level: expected a level above 0 and up to 1, got {self.least_level}")
-        if min(self.absolute, self.squared, self.distance) < 0:
-            raise ArgumentError("recipe: expected weights of errors of 0 or more")
+        weights = (self.absolute, self.squared, self.distance)
+        if not all(0 <= each < math.inf for each in weights):
+            raise ArgumentError(f"recipe: expected finite weights of errors of 0 or more, got {weights}")
         height, width = self.size
         if height % 16 or width != 2 * height:
             raise ArgumentError(f"recipe: size: expected a height of a multiple of 16, twice as wide, got {self.size}")

@@ -23,7 +23,7 @@ from wiw.datasets.demonstration import Outline, name_demonstration
 from wiw.datasets.demonstrations import Demonstrations, read_manifest
 from wiw.datasets.navigation import META, Clips, NavigationData, Part, part_of
 from wiw.datasets.parquet_files import MANIFEST
-from wiw.datasets.scene_splits import list_evaluation_scenes
+from wiw.datasets.scene_splits import list_evaluation_scenes, match_names
 from wiw.errors import ArgumentError, FileError
 from wiw.training.held_out_clips import HeldOutClips
 from wiw.training.held_out_demonstrations import DemonstratedPlan, select_demonstrations
@@ -72,6 +72,10 @@ class Corpus(ABC):
     @abstractmethod
     def units(self) -> set[str]:
         """Names of the scenes or demonstrations that it has."""
+
+    def list_shared(self, other: Corpus) -> list[str]:
+        """Return the names of its scenes or demonstrations that another corpus of the kind may have, too, sorted."""
+        return sorted(self.units & other.units)
 
     @property
     @abstractmethod
@@ -184,6 +188,13 @@ class NavigationCorpus(Corpus):
     def units(self) -> set[str]:
         """Names of the scenes, without their edits."""
         return self.data.scenes
+
+    def list_shared(self, other: Corpus) -> list[str]:
+        """Return the names of its scenes that may be of a scene of the other one: a name depends on the other scenes.
+
+        Names are alike whose ends are: "mesh" and "a/mesh".
+        """
+        return sorted({own for own, _ in match_names(self.units, other.units)})
 
     @property
     def camera_height(self) -> float | None:

@@ -18,7 +18,8 @@ from wiw.networks import memory_guard, resolve_device
 from wiw.ray_cluster import HERE, Engine, map_batches
 from wiw.training.post_training.clip_trainer import arrange_clips
 from wiw.training.post_training.corpora import CorpusPart, open_corpus
-from wiw.training.post_training.families import PretrainedWeights, find_family
+from wiw.training.post_training.families import PretrainedWeights, announce_shape, find_family
+from wiw.training.post_training.latent_cache import require_folder
 from wiw.training.post_training.recipe import PostTrainingRecipe, load_recipe
 from wiw.training.post_training.train import choose_precision, list_smaller, open_cache
 from wiw.training.post_training.trainable import Encoded
@@ -63,6 +64,7 @@ def encode_clips(
         FileError, WeightsError, DependencyError, DeviceMemoryError, InfrastructureError: likewise.
     """
     place.require_valid("encode")
+    require_folder(Path(cache))
     if workers < 1 or (workers > 1 and place.engine != "ray"):
         raise ArgumentError(f"encode: expected 1 worker, or several with engine ray, got {workers}")
     device = choose_encoding_device(place, weights.pop("device", None))
@@ -135,6 +137,7 @@ class ClipEncoder:
 def _list_rows(name: str, data: str | Path, recipe: PostTrainingRecipe, part: CorpusPart) -> Iterator[dict[str, Any]]:
     """Yield the clips that a training uses, including mirrored ones where it mirrors some."""
     corpus, fitted = find_family(name).fit(open_corpus(data, part, recipe.held_out), recipe)
+    announce_shape(name, recipe, fitted)
     order = arrange_clips(len(corpus.clips(fitted.frames)), fitted)
     sides = [side for side, share in ((False, 1 - fitted.mirror), (True, fitted.mirror)) if share > 0]
     for index in np.sort(order.chosen).tolist():

@@ -3,9 +3,11 @@
 
 from __future__ import annotations
 
+import logging
+import math
 from abc import ABC, abstractmethod
-from collections.abc import Mapping
-from dataclasses import dataclass, replace
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, fields, replace
 from pathlib import Path
 from typing import Any
 
@@ -30,6 +32,8 @@ from wiw.world_models.nwm.model import NWM
 from wiw.world_models.video.actions import variants
 from wiw.world_models.video.actions.model import PANORAMA, ActionConditioned
 from wiw.world_models.video.model import VideoModel
+
+_log = logging.getLogger("wiw.training")
 
 
 @dataclass(frozen=True)
@@ -72,10 +76,11 @@ class Family(ABC):
 
     @abstractmethod
     def fit(self, corpus: Corpus, recipe: PostTrainingRecipe) -> tuple[Corpus, PostTrainingRecipe]:
-        """Return a corpus in the views that the model sees, and the recipe with the size of its frames there.
+        """Return a corpus in the views that the model sees, and the recipe with frames and size as it takes them.
 
         Raises:
-            ArgumentError: the model cannot be trained on such a corpus; says which it can be trained on.
+            ArgumentError: the model cannot be trained on such a corpus, which says on which it can be, or the recipe
+                has an option that it does not read.
         """
 
     def list_options(self, corpus: Corpus, recipe: PostTrainingRecipe) -> dict[str, Any]:
@@ -99,17 +104,27 @@ class VideoFamily(Family):
     world_model: str
     model: type[ActionConditioned]
     objective: type[Objective]
+    unread: tuple[str, ...] = ("shift", "still")
+    """Options of a recipe that it does not read."""
+    most_drop: float = 1.0
+    """Largest share `drop` that it can have."""
     checkpoint_option = "checkpoint"
 
     def fit(self, corpus: Corpus, recipe: PostTrainingRecipe) -> tuple[Corpus, PostTrainingRecipe]:
-        """Return both as they are, but for the size where the recipe leaves it open."""
+        """Return the corpus as it is, and the recipe with frames and size as the generator rounds them."""
+        require_read(self.world_model, recipe, self.unread)
+        if recipe.drop > self.most_drop:
+            raise ArgumentError(
+                f"recipe: drop: {self.world_model} drops the observation's embedding, its channels, or both, in this "
+                f"share of the clips each; expected a third at most, got {recipe.drop}"
+            )
         if corpus.space != GRIPPER_POSES:
             require_panoramas(self.world_model, corpus)
         if corpus.space == GRIPPER_POSES and recipe.mirror:
             raise ArgumentError(
                 "recipe: mirror: the mirror image of a robot arm is a different arm; expected 0 for poses"
             )
-        return corpus, replace(recipe, size=recipe.size or self._find_size(corpus))
+        return corpus, round_shape(self.model.generator_class, recipe, recipe.size or self._find_size(corpus))
 
     def list_options(self, corpus: Corpus, recipe: PostTrainingRecipe) -> dict[str, Any]:
         """Return size and frames of the clips."""
@@ -132,6 +147,35 @@ class VideoFamily(Family):
         return Loaded(model, recipe, identify_weights(generator))
 
 
+def round_shape(generator: type[VideoModel], recipe: PostTrainingRecipe, size: tuple[int, int]) -> PostTrainingRecipe:
+    """Return a recipe with frames and a size that a generator can divide, as it rounds them itself once it is made."""
+    height, width = (max(1, round(side / generator.multiple)) * generator.multiple for side in size)
+    frames = 1 + math.ceil((recipe.frames - 1) / generator.stride) * generator.stride
+    return replace(recipe, frames=frames, size=(height, width))
+
+
+def announce_shape(name: str, asked: PostTrainingRecipe, fitted: PostTrainingRecipe) -> None:
+    """Warn where frames or size of a recipe are not those that a model takes."""
+    changed = [f"frames={fitted.frames} in place of {asked.frames}"] if fitted.frames != asked.frames else []
+    if asked.size not in (None, fitted.size):
+        changed.append(f"size={list(fitted.clip_size)} in place of {list(asked.clip_size)}")
+    if changed:
+        _log.warning("%s takes other shapes; it is trained with %s", name, " and ".join(changed))
+
+
+def require_read(name: str, recipe: PostTrainingRecipe, unread: Sequence[str]) -> None:
+    """Check that a recipe leaves the options that a model does not read as they are by default.
+
+    Raises:
+        ArgumentError: it sets one of them.
+    """
+    for field in fields(recipe):
+        if field.name in unread and getattr(recipe, field.name) != field.default:
+            raise ArgumentError(
+                f"recipe: {field.name}: {name} does not read it; leave it out, got {getattr(recipe, field.name)}"
+            )
+
+
 class NWMFamily(Family):
     """Navigation World Models, which is conditioned on motions between front views already."""
 
@@ -145,6 +189,7 @@ class NWMFamily(Family):
                 "nwm-action follows a moving agent, but this dataset is of a gripper; expected a dataset of `wiw "
                 "collect navigation`, or a video model (NAME-action)"
             )
+        require_read("nwm-action", recipe, ("shift",))
         size = recipe.size or NWM.accepts.size
         return corpus.show_front(size), replace(recipe, size=size)
 
@@ -163,11 +208,11 @@ class NWMFamily(Family):
 
 
 FAMILIES: Mapping[str, Family] = {
-    "svd-action": VideoFamily("svd-action", variants.SVDAction, SVDObjective),
+    "svd-action": VideoFamily("svd-action", variants.SVDAction, SVDObjective, most_drop=1 / 3),
     "ltx-action": VideoFamily("ltx-action", variants.LTXAction, LTXObjective),
-    "wan2.1-action": VideoFamily("wan2.1-action", variants.Wan21Action, WanObjective),
-    "wan2.2-5b-action": VideoFamily("wan2.2-5b-action", variants.Wan22SmallAction, WanObjective),
-    "wan2.2-a14b-action": VideoFamily("wan2.2-a14b-action", variants.Wan22Action, WanObjective),
+    "wan2.1-action": VideoFamily("wan2.1-action", variants.Wan21Action, WanObjective, ("still",)),
+    "wan2.2-5b-action": VideoFamily("wan2.2-5b-action", variants.Wan22SmallAction, WanObjective, ("still",)),
+    "wan2.2-a14b-action": VideoFamily("wan2.2-a14b-action", variants.Wan22Action, WanObjective, ("still",)),
     "cosmos-predict2-action": VideoFamily("cosmos-predict2-action", variants.CosmosPredict2Action, CosmosObjective),
     "nwm-action": NWMFamily(),
 }

@@ -15,6 +15,7 @@ from safetensors import SafetensorError
 from safetensors.torch import load, save
 from torch import Tensor
 
+from wiw.errors import ArgumentError
 from wiw.files import atomic_file
 from wiw.training.post_training.trainable import Encoded
 
@@ -24,6 +25,17 @@ CHECKSUM = "crc32"
 """Entry of a file's metadata: the CRC-32 of its tensors with their names, types and shapes, which safetensors lacks."""
 FILES = 1000
 """Clips in a folder."""
+
+
+def require_folder(path: Path) -> None:
+    """Check that a cache can be in a folder of that path, which need not be there.
+
+    Raises:
+        ArgumentError: it, or what it is to be in, is a file.
+    """
+    there = next((each for each in (path, *path.absolute().parents) if each.exists()), None)
+    if there is not None and not there.is_dir():
+        raise ArgumentError(f"cache: expected a folder, new or not, got {path}: {there} is a file; choose another path")
 
 
 class LatentCache:

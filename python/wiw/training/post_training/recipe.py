@@ -69,8 +69,11 @@ class ClipRecipe(ABC):
         for name in ("rate", "clip_norm", "shift"):
             if not (math.isfinite(getattr(self, name)) and getattr(self, name) > 0):
                 raise ArgumentError(f"recipe: {name}: expected a finite number above 0, got {getattr(self, name)}")
-        if self.weight_decay < 0 or not 0 <= self.seed < 2**63:
-            raise ArgumentError("recipe: expected a weight_decay of 0 or more, and a seed from 0 to 2**63 - 1")
+        if not 0 <= self.weight_decay < math.inf or not 0 <= self.seed < 2**63:
+            raise ArgumentError(
+                "recipe: expected a finite weight_decay of 0 or more, and a seed from 0 to 2**63 - 1, got "
+                f"{self.weight_decay} and {self.seed}"
+            )
         if self.size is not None and (len(self.size) != 2 or min(self.size) < 8):
             raise ArgumentError(f"recipe: size: expected height and width in pixels, got {self.size}")
 

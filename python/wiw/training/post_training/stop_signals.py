@@ -13,6 +13,7 @@ from typing import Any
 from wiw.errors import ArgumentError
 from wiw.training.checkpoint import Checkpoint, ResumableTrainer, TrainingState
 from wiw.training.post_training import distributed
+from wiw.training.save_signal import HeldSignal
 
 STOPPING = (signal.SIGTERM, signal.SIGINT)
 """Signals after which the training stops, once its state is written; after SIGUSR1 it continues."""
@@ -21,8 +22,8 @@ STOPPING = (signal.SIGTERM, signal.SIGINT)
 class SignalledCheckpoint(Checkpoint):
     """Write the state at the end of the step in which a signal comes; see `Checkpoint`.
 
-    Within `watch`, SIGUSR1 writes the state. SIGTERM and SIGINT (Ctrl-C) write it, and then do what they would have
-    done without this; a second one does so at once.
+    Within `watch`, SIGUSR1 writes the state, also one that `hold_save_signal` has kept. SIGTERM and SIGINT (Ctrl-C)
+    write it, and then do what they would have done without this; a second one does so at once.
 
     With several processes, a signal to any of them is one to all. They have to call `save_if_due` alike. The first one
     writes; a second signal is ignored, since torchrun hands on what a batch system sends to each process itself.
@@ -52,6 +53,9 @@ class SignalledCheckpoint(Checkpoint):
         self._earlier: dict[int, Any] = {
             number: signal.signal(number, self._note) for number in (*STOPPING, signal.SIGUSR1)
         }
+        held = self._earlier[signal.SIGUSR1]
+        if isinstance(held, HeldSignal) and held.take():  # it came before there was a step
+            self._pending = signal.SIGUSR1
         wakeup = signal.set_wakeup_fd(-1)  # its reader may end the process before a long step has
         try:
             yield

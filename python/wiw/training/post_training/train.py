@@ -4,7 +4,6 @@
 from __future__ import annotations
 
 import json
-import shutil
 from collections.abc import Callable, Mapping
 from dataclasses import replace
 from functools import partial
@@ -21,14 +20,14 @@ from wiw.training.held_out_clips import Imagine
 from wiw.training.post_training import distributed
 from wiw.training.post_training.clip_trainer import ClipTrainer, arrange_clips
 from wiw.training.post_training.corpora import Corpus, CorpusPart, open_corpus, require_training_split
-from wiw.training.post_training.families import Family, Loaded, PretrainedWeights, find_family
-from wiw.training.post_training.latent_cache import LatentCache
+from wiw.training.post_training.families import Family, Loaded, PretrainedWeights, announce_shape, find_family
+from wiw.training.post_training.latent_cache import LatentCache, require_folder
 from wiw.training.post_training.recipe import ClipRecipe, PostTrainingRecipe, load_recipe
 from wiw.training.post_training.sampling import create_sampler
 from wiw.training.post_training.stop_signals import SignalledCheckpoint
 from wiw.training.post_training.trackers import open_tracker
 from wiw.training.post_training.trainer import PostTrainer
-from wiw.training.post_training.training_log import TrainingLog
+from wiw.training.post_training.training_log import LOG, TrainingLog, remove_log, require_own_log
 from wiw.training.post_training.validation import (
     CARD,
     OnValidation,
@@ -37,16 +36,16 @@ from wiw.training.post_training.validation import (
     build_validation_set,
     find_held_out,
 )
+from wiw.training.save_signal import hold_save_signal
 from wiw.training.trainer import run_training, take_middles
 from wiw.types import GRIPPER_POSES, PRIMITIVES
 from wiw.world_models.video import loading
 
-LOG = "metrics.jsonl"
-"""Loss of each step and what validations found, in `OUT.log`."""
 TASKS: Mapping[str, str] = {PRIMITIVES: "imagenav", GRIPPER_POSES: "manipulation"}
 """A task for the actions of each space."""
 
 
+@hold_save_signal()
 @distributed.join_processes()
 def post_train(
     name: str,
@@ -100,7 +99,8 @@ def post_train(
     Raises:
         ArgumentError: a model that is not trained here or not on such data, scenes of a split for evaluation, too few
             clips, a recipe that the model cannot have, a state of a training with other data or numbers, or validation
-            on what is trained on, not there, or of another kind.
+            on what is trained on, not there, or of another kind; a folder of the log with files of others, or a file
+            in the place of a folder.
         TrainingError: the loss is not finite; the last good state is kept, the message names the batch.
         FileError: `out` holds something, or the dataset is missing or damaged.
         WeightsError, DependencyError, DeviceMemoryError: see the world model.
@@ -110,7 +110,13 @@ def post_train(
     distributed.require_own_gpu(device)
     recipe = recipe or choose_precision(load_recipe(name), device)
     _require_free(out)
-    corpus, recipe = family.fit(open_corpus(data, part, recipe.held_out), recipe)
+    require_own_log(locate_log(out), out.name, locate_checkpoint(out).exists())
+    if cache is not None:
+        require_folder(Path(cache))
+    asked = recipe
+    corpus, recipe = family.fit(open_corpus(data, part, recipe.held_out), asked)
+    if distributed.is_main():
+        announce_shape(name, asked, recipe)
     require_training_split(corpus)
     arrange_clips(len(corpus.clips(recipe.frames)), recipe)
     held_out = find_held_out(partial(open_part, family, recipe), corpus, validation, decisions, recipe)
@@ -185,10 +191,10 @@ def train_and_validate(
         FileError: a clip cannot be read, or something cannot be written; the state before is kept if it can be written,
             and there is no other process.
         DependencyError: the tracker's package is not installed.
-        ArgumentError: see `wiw.training.checkpoint.Checkpoint`.
+        ArgumentError: the log's folder has files of others; see also `wiw.training.checkpoint.Checkpoint`.
     """
     if not state.path.exists() and distributed.is_main():
-        shutil.rmtree(locate_log(out), ignore_errors=True)
+        remove_log(locate_log(out), out.name)
     epochs = trainer.recipe.epochs
     validated = ValidatedTrainer(
         trainer,

@@ -6,14 +6,64 @@ from __future__ import annotations
 import errno
 import json
 import os
+import re
+import shutil
 import time
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
-from wiw.errors import FileError
+from wiw.errors import ArgumentError, FileError
 from wiw.files import atomic_file
-from wiw.training.post_training.trackers import Tracker
+from wiw.training.post_training.trackers import RUN_ID, Tracker
+
+LOG, BEST = "metrics.jsonl", "best"
+"""Names in `OUT.log`: of the file of lines, and of the folder of the weights that are best in validation so far."""
+_OWN = re.compile(rf"{re.escape(LOG)}|{RUN_ID}|step-[0-9]{{7,}}\.png|\..+\.part")
+"""Names of what a training writes there."""
+_OF_TENSORBOARD = re.compile(r"events\.out\.tfevents.*|hparams\.yml")
+
+
+def require_own_log(folder: Path, run: str, resumes: bool) -> None:
+    """Check that a training may write its log into a folder, which it empties first unless it resumes.
+
+    Args:
+        folder: of the log; need not be there.
+        run: name of the training, under which tensorboard writes.
+        resumes: whether it resumes, and keeps what is there.
+
+    Raises:
+        ArgumentError: it is a file, or would be emptied and holds what no training has written.
+    """
+    remedy = "move it away, or choose another --out"
+    if folder.exists() and not folder.is_dir():
+        raise ArgumentError(f"{folder}: expected a folder for the log, new or of a training, got a file; {remedy}")
+    if resumes or not folder.exists():
+        return
+    if others := sorted(path.name for path in folder.iterdir() if not _is_own(path, run)):
+        raise ArgumentError(
+            f"{folder}: expected a folder for the log, new or of a training, as it is emptied, but it has "
+            f"{', '.join(others[:3])}; {remedy}"
+        )
+
+
+def remove_log(folder: Path, run: str) -> None:
+    """Delete the log of a training of before, with its pictures and best weights.
+
+    Raises:
+        ArgumentError: see `require_own_log`.
+    """
+    require_own_log(folder, run, resumes=False)
+    shutil.rmtree(folder, ignore_errors=True)
+
+
+def _is_own(path: Path, run: str) -> bool:
+    """Return whether a training, or tensorboard for it, has written what is there."""
+    if path.is_dir() and path.name == BEST:
+        return path.with_name(LOG).is_file()  # lines come before the best weights
+    if path.is_dir() and path.name == run:
+        return all(_OF_TENSORBOARD.fullmatch(each.name) for each in path.rglob("*") if not each.is_dir())
+    return _OWN.fullmatch(path.name) is not None
 
 
 class TrainingLog:

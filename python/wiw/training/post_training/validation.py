@@ -26,7 +26,7 @@ from wiw.training.post_training import distributed
 from wiw.training.post_training.clip_trainer import ClipTrainer
 from wiw.training.post_training.corpora import Corpus
 from wiw.training.post_training.recipe import ClipRecipe
-from wiw.training.post_training.training_log import TrainingLog
+from wiw.training.post_training.training_log import BEST, TrainingLog
 from wiw.types import PRIMITIVES
 
 CARD = "training.json"
@@ -112,13 +112,13 @@ def find_held_out(
         )
     if decisions is not None and corpus.space != PRIMITIVES:
         raise ArgumentError("decisions: those of `wiw collect decisions` are for a moving agent; leave them out")
-    names, trained = held_out.units, corpus.units
-    if names & trained:
+    if shared := held_out.list_shared(corpus):
         raise ArgumentError(
-            f"validation: expected {corpus.unit}s that are not trained on, got {', '.join(sorted(names & trained)[:3])}"
+            f"validation: expected {corpus.unit}s that are not trained on, got {', '.join(shared[:3])}; leave them out "
+            f"of {held_out.data.folder}, or train on others"
         )
-    _require_unseen_decisions(decisions, trained)
-    if not names:
+    _require_unseen_decisions(decisions, corpus.units)
+    if not held_out.units:
         raise ArgumentError(
             f"validation: no {corpus.unit} of {held_out.data.folder} is held out; collect more {corpus.unit}s, raise "
             "held_out in the recipe, give another dataset with --validation, or train without validation (--option "
@@ -267,7 +267,7 @@ class ValidatedTrainer(ResumableTrainer):
     @property
     def best(self) -> Path:
         """Folder of the best weights."""
-        return self._folder / "best"
+        return self._folder / BEST
 
     def state_dict(self) -> dict[str, Any]:
         """Return the trainer's state."""
