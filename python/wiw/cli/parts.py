@@ -3,7 +3,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Literal
@@ -131,13 +131,14 @@ class AgentFlags:
             self.revision and absolute(self.revision),
         )
         options = policy_options(policy, self.policy_option, self._vlm_options([policy, reviser or "", *policies]))
+        options = policy_options(reviser, self.revision_option, options, "--revision-option")
         model = None if self.world_model == "none" else absolute(self.world_model)
         return AgentRecipe(
             policy, model, reviser, **vars(search),
             model_options=model_options(model, self.world_model_option),
             semantics=self.semantics and absolute(self.semantics),
             semantics_options=semantics_options(self.semantics, self.semantics_option),
-            policy_options=policy_options(reviser, self.revision_option, options, "--revision-option"),
+            policy_options={name: _name_places(own) for name, own in options.items()},
             tracker=self.tracker and absolute(self.tracker),
             tracker_options=tracker_options(self.tracker, self.tracker_option),
         )  # fmt: skip
@@ -159,9 +160,28 @@ class AgentFlags:
 def _make_absolute(name: str, value: Any) -> str:
     """Return an option of policy vlm, made absolute if it is a path."""
     from wiw.policies.vlm.prompts.templates import SETS
-    from wiw.vlm.servers import ANNOUNCED
 
-    if name == "vlm" and str(value).startswith(ANNOUNCED):
-        return f"{ANNOUNCED}{Path(str(value).removeprefix(ANNOUNCED)).expanduser().resolve()}"
     is_path = isinstance(value, Path) or (name == "prompts" and value not in SETS)
     return str(Path(value).expanduser().resolve()) if is_path else str(value)
+
+
+def _name_places(options: Mapping[str, Any]) -> dict[str, Any]:
+    """Return a policy's options with the place of its language model, and of its roles', named from the root on."""
+    made = dict(options)
+    if isinstance(place := options.get("vlm"), str):
+        made["vlm"] = _name_place(place)
+    if isinstance(roles := options.get("roles"), Mapping):
+        made["roles"] = {role: _name_places(own) if isinstance(own, Mapping) else own for role, own in roles.items()}
+    return made
+
+
+def _name_place(vlm: str) -> str:
+    """Return where a language model is, with its folder or file, if it has one, named from the root on."""
+    from wiw.runs.part_options import find_path
+    from wiw.vlm.servers import ANNOUNCED
+
+    kind, _, place = vlm.partition(":")
+    if vlm.startswith(ANNOUNCED):  # there may be none yet
+        return f"{ANNOUNCED}{Path(place).expanduser().resolve()}"
+    path = find_path(place) if kind in ("transformers", "replay") else None  # else the name of a model on a hub
+    return vlm if path is None else f"{kind}:{path}"

@@ -15,7 +15,7 @@ from typing import Annotated, Any
 from tyro.conf import Positional, arg
 
 from wiw.cli.options import Options
-from wiw.wire.address_book import ServerAddress, announce_server, find_token, name_reachable
+from wiw.wire.address_book import ServerAddress, announce_server, find_token, name_reachable, require_announcement
 
 SHOWN, LOGGED = 1.0, 10.0
 """Seconds between status lines, on a terminal and elsewhere."""
@@ -38,6 +38,8 @@ def serve(
     grace: Annotated[float, arg(metavar="SECONDS")] = 30.0,
     announce: Annotated[Path | None, arg(metavar="FILE")] = None,
     idle: Annotated[float | None, arg(metavar="SECONDS")] = None,
+    await_first: Annotated[float | None, arg(metavar="SECONDS")] = None,
+    clients: Annotated[int, arg(metavar="N")] = 256,
     stall: Annotated[float | None, arg(metavar="SECONDS")] = None,
 ) -> int:
     """Serve a world model to runs in other processes or on other machines.
@@ -71,6 +73,8 @@ def serve(
         announce: File (.json) that announces address and token while the server is up; clients are given its folder.
             Only its owner can read it. Without --token a random one is used.
         idle: Seconds without any client after which the server exits. Default: never.
+        await_first: Seconds that it waits for its first client, where --idle is given. Default: as --idle.
+        clients: Maximum number of connections at a time: each worker of a run has one.
         stall: Seconds that the model may take for one call. After that it counts as hung, and the server exits with
             code 2, so that what started it can start it again; `inf` never does. Default: four times the longest
             deadline of a client, and at least 1200.
@@ -80,17 +84,21 @@ def serve(
     from wiw.serving.server import Server, Settings
     from wiw.serving.watchdog import Watchdog
 
+    require_announcement(announce)
     secret = find_token(token, announce)
-    settings = Settings(host, port, secret, queue, window, certificate, key, grace)
+    settings = Settings(host, port, secret, queue, window, certificate, key, grace, clients)
     options = parse_options(world_model_option, WORLD_MODELS.find_here(model), "--world-model-option")
     server = Server(WORLD_MODELS.make_here(model, **options), settings)  # here: this process holds no simulator
-    asyncio.run(_live(server, model, announce, idle, Watchdog(server, stall)))
+    patience = None if idle is None else (idle if await_first is None else await_first, idle)
+    asyncio.run(_live(server, model, announce, patience, Watchdog(server, stall)))
     return 0
 
 
-async def _live(server: Any, name: str, announce: Path | None, idle: float | None, watchdog: Any) -> None:
+async def _live(
+    server: Any, name: str, announce: Path | None, patience: tuple[float, float] | None, watchdog: Any
+) -> None:
     """Serve until a signal arrives, the server has been idle for too long, or its model hangs; announce it and print
-    status lines.
+    status lines. `patience` is how long it waits for its first client, and later for another one.
     """
     loop, signals = asyncio.get_running_loop(), 0
     ready = asyncio.Event()
@@ -117,7 +125,7 @@ async def _live(server: Any, name: str, announce: Path | None, idle: float | Non
     for number in (signal.SIGTERM, signal.SIGINT, signal.SIGUSR2):
         loop.add_signal_handler(number, stop)
     beside = [asyncio.ensure_future(_show(server, name, ready))]
-    beside += [] if idle is None else [asyncio.ensure_future(_end_if_idle(server, idle, ready))]
+    beside += [] if patience is None else [asyncio.ensure_future(_end_if_idle(server, *patience, ready))]
     beside += [asyncio.ensure_future(_end_if_hung(watchdog, announcing))]
     try:
         await serving
@@ -130,13 +138,14 @@ async def _live(server: Any, name: str, announce: Path | None, idle: float | Non
         await asyncio.gather(*beside, return_exceptions=True)
 
 
-async def _end_if_idle(server: Any, seconds: float, ready: asyncio.Event) -> None:
-    """Stop a server once it has had no client for so many seconds."""
+async def _end_if_idle(server: Any, at_first: float, later: float, ready: asyncio.Event) -> None:
+    """Stop a server once it has had no client for so many seconds: before the first one, and after one."""
     await ready.wait()
-    last = time.monotonic()
-    while time.monotonic() - last < seconds:
-        await asyncio.sleep(min(1.0, seconds / 4))
-        last = time.monotonic() if server.clients else last
+    last, limit = time.monotonic(), at_first
+    while time.monotonic() - last < limit:
+        await asyncio.sleep(min(1.0, later / 4))
+        if server.clients:
+            last, limit = time.monotonic(), later
     server.end()
 
 

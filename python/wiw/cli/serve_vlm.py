@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 from tyro.conf import arg
 
-from wiw.wire.address_book import ServerAddress, announce_server, find_token, name_reachable
+from wiw.wire.address_book import ServerAddress, announce_server, find_token, name_reachable, require_announcement
 
 if TYPE_CHECKING:
     from wiw.serving.vlm_server import VlmServer
@@ -30,6 +30,7 @@ def serve_vlm(
     token: Annotated[str | None, arg(metavar="SECRET")] = None,
     announce: Annotated[Path | None, arg(metavar="FILE")] = None,
     idle: Annotated[float | None, arg(metavar="SECONDS")] = None,
+    await_first: Annotated[float | None, arg(metavar="SECONDS")] = None,
     seed: Annotated[int, arg(metavar="N")] = 0,
 ) -> int:
     """Serve a vision-language model, with the API of OpenAI and vLLM, for tests.
@@ -53,10 +54,12 @@ def serve_vlm(
         announce: File (.json) that announces address and token while the server is up; clients are given its folder.
             Only its owner can read it. Without --token a random one is used.
         idle: Seconds without any request after which the server exits. Default: never.
+        await_first: Seconds that it waits for its first request, where --idle is given. Default: as --idle.
         seed: Seed of the random weights.
     """
     import tempfile
 
+    require_announcement(announce)
     secret = find_token(token, announce)
     with (
         tempfile.TemporaryDirectory() as folder,
@@ -66,17 +69,19 @@ def serve_vlm(
         print(f"{server.model} at {server.url}", flush=True)
         if announce is not None:
             announcing.enter_context(announce_server(ServerAddress(name_reachable(server.url), secret), announce))
-        _wait_for_end(server, idle)
+        _wait_for_end(server, None if idle is None else (idle if await_first is None else await_first, idle))
     return 0
 
 
-def _wait_for_end(server: VlmServer, idle: float | None) -> None:
-    """Wait until a signal arrives or the server has been idle for too long."""
+def _wait_for_end(server: VlmServer, patience: tuple[float, float] | None) -> None:
+    """Wait until a signal arrives or the server has been idle for too long; `patience` is how long it waits for its
+    first request, and later for another one.
+    """
     ended = threading.Event()
     before = {number: signal.signal(number, lambda *_: ended.set()) for number in SIGNALS}
     try:
-        while not ended.wait(GLANCE if idle is None else min(GLANCE, idle / 4)):
-            if idle is not None and server.idle_seconds >= idle:
+        while not ended.wait(GLANCE if patience is None else min(GLANCE, patience[1] / 4)):
+            if patience is not None and server.idle_seconds >= patience[server.was_asked]:
                 return
     finally:
         for number, handler in before.items():

@@ -19,19 +19,18 @@ from wiw.errors import ArgumentError
 from wiw.loop import keys
 from wiw.loop.config import AgentConfig
 from wiw.runs.config import RunConfig
+from wiw.runs.hidden_secrets import SECRETS
 from wiw.runs.shards import Shard
-from wiw.runs.submission import FILE_NAME, ClusterConfig, SubmittedJob
+from wiw.runs.submission import FILE_NAME, ClusterConfig, ServerConfig, SubmittedJob
 
 if TYPE_CHECKING:
     from wiw.runs.recipes import AgentRecipe
 
-CLUSTER = ClusterConfig()
+CLUSTER, SERVING = ClusterConfig(), ServerConfig()
 SERVERS, VLM_SERVERS = "servers", "vlm-servers"
 """Subfolders of the run's folder in which servers of the world model and the language model announce themselves."""
-IDLE = "1800"
-"""Seconds without a client after which a server exits."""
-SECRETS = {"key": "OPENAI_API_KEY", "token": "WIW_TOKEN"}
-"""Options that are secrets of servers, which no store keeps, and the environment variables read in their place."""
+IDLE, AWAIT_FIRST = "1800", "86400"
+"""Seconds without a client after which a server exits: after one, and before the first, as shards may have to queue."""
 
 
 def submit(
@@ -39,8 +38,8 @@ def submit(
     /,
     *,
     shards: Annotated[int, arg(metavar="N")] = 8,
-    server_partition: Annotated[str | None, arg(metavar="NAME")] = None,
     jobs: Annotated[ClusterConfig, arg(name="")] = CLUSTER,
+    serving: Annotated[ServerConfig, arg(name="")] = SERVING,
     retry_errors: bool = False,
     dry_run: bool = False,
     parts: Annotated[AgentFlags, arg(name="")] = AGENT,
@@ -68,9 +67,9 @@ def submit(
     Args:
         task: See `wiw list`.
         shards: Number of shards of the episodes, one job each.
-        server_partition: SLURM partition for the jobs of --servers and --vlm-servers. Default: --partition. A server
-            exits after half an hour without a client.
-        jobs: What a job requests from the cluster.
+        jobs: What the job of a shard requests from the cluster.
+        serving: What the job of a server requests instead. A server exits after half an hour without a client, or after
+            a day without a first one.
         retry_errors: Also submit finished shards whose episodes include infrastructure errors, to run these again.
         dry_run: Print the commands and submit nothing.
         parts: The agent.
@@ -88,15 +87,15 @@ def submit(
             raise ArgumentError(f"submit: --{name} is set for each job; leave it out")
     if config.served is not None:
         raise ArgumentError("submit: --servers always serve --world-model; --served is for --engine ray only")
-    if server_partition is not None and not (config.servers or config.vlm_servers):
+    if (given := format_flags(serving)) and not (config.servers or config.vlm_servers):
         raise ArgumentError(
-            "submit: --server-partition is for the jobs of --servers and --vlm-servers: give their number with it"
+            f"submit: {given[0]} is for the jobs of --servers and --vlm-servers: give their number with it"
         )
     prepared = prepare_run(task, parts, arms, rules, search, replace(config, salt=_find_salt(config)))
     _require_no_secrets(prepared)
     folder, count = Path(prepared.settings.out or ""), prepared.count
     Shard(1, shards).select(count)
-    serving = _write_servers(folder, prepared, parts.world_model, jobs.cluster)
+    servers = _write_servers(folder, prepared, parts.world_model, jobs.cluster)
     if prepared.settings.servers:
         asked = _name_servers(folder, SERVERS)
         parts, arms = (
@@ -111,13 +110,13 @@ def submit(
         parts = replace(parts, vlm=_name_servers(folder, VLM_SERVERS))
     parted = [Shard(number, shards) for number in range(1, shards + 1)]
     commands = {shard: _write_command(task, arms, (parts, rules, search), prepared.settings, shard) for shard in parted}
-    active = _require_alone(folder, [*serving, *commands.values()])
+    active = _require_alone(folder, [*servers, *commands.values()])
     left, errors = _list_left(folder, commands, retry_errors, str(prepared.settings.scratch or "auto"))
-    absent = {command: gpus for command, gpus in serving.items() if left and command not in active}
+    absent = {command: gpus for command, gpus in servers.items() if left and command not in active}
     for command in [*absent, *left]:
         print(shlex.join(["wiw", *command]))
     if left and not dry_run:
-        begun = _submit_servers(folder, absent, replace(jobs, partition=server_partition or jobs.partition))
+        begun = _submit_servers(folder, absent, jobs, serving)
         submitted = submit_commands(folder, left, jobs, _name_jobs(folder), begun)
         print(f"\njobs    {submitted[0].id} to {submitted[-1].id}, output in {folder / 'jobs'}")
     if not left:
@@ -241,7 +240,8 @@ def _write_servers(folder: Path, prepared: PreparedRun, model: str, cluster: str
         SERVERS: write_commands(prepared.built, prepared.recipes, settings),
         VLM_SERVERS: write_vlm_commands(prepared.recipes, settings),
     }
-    listen = ("--host", "127.0.0.1" if cluster == "local" else "0.0.0.0", "--port", "0", "--idle", IDLE)
+    host = "127.0.0.1" if cluster == "local" else "0.0.0.0"
+    listen = ("--host", host, "--port", "0", "--idle", IDLE, "--await-first", AWAIT_FIRST)
     return {
         (*command.arguments, *listen, "--announce", str(folder / place / f"{number}.json")): command.gpus
         for place, commands in kinds.items()
@@ -251,7 +251,7 @@ def _write_servers(folder: Path, prepared: PreparedRun, model: str, cluster: str
 
 
 def _submit_servers(
-    folder: Path, commands: Mapping[tuple[str, ...], float], config: ClusterConfig
+    folder: Path, commands: Mapping[tuple[str, ...], float], shards: ClusterConfig, config: ServerConfig
 ) -> list[SubmittedJob]:
     """Submit the servers, one array for those with the same number of GPUs; return their jobs."""
     from wiw.runs.submission import submit_commands
@@ -259,7 +259,8 @@ def _submit_servers(
     begun = []
     for gpus in sorted({math.ceil(each) for each in commands.values()}):
         own = [command for command, each in commands.items() if math.ceil(each) == gpus]
-        begun += submit_commands(folder, own, replace(config, gpus=gpus), f"{_name_jobs(folder)}-server")
+        jobs = config.make_jobs(shards, len(own), gpus)
+        begun += submit_commands(folder, own, jobs, f"{_name_jobs(folder)}-server")
     return begun
 
 

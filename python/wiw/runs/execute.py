@@ -13,7 +13,7 @@ from wiw.runs.films import film_episodes
 from wiw.runs.pictures import drop_spare_pictures
 from wiw.runs.progress import ArmProgress, Board, Tracker, make_board
 from wiw.runs.recipes import AgentRecipe, TaskRecipe
-from wiw.runs.rows import AgentRow, DecisionRow, LostRow, RestartRow
+from wiw.runs.rows import AgentRow, DecisionRow, LostRow, RestartRow, to_json
 from wiw.runs.scene_map import draw_scene_maps
 from wiw.runs.sources import file_exists, require_sources
 from wiw.runs.store import RunStore
@@ -258,15 +258,14 @@ class _StoreWriter:
 
     def __init__(self, store: RunStore, tracker: Tracker) -> None:
         self._store, self._tracker = store, tracker
-        self._known: set[str] = set()
+        self._known: dict[str, str] = {}
+        """By arm: what its agent says of itself, as JSON."""
         self._first_errors: dict[str, list[str] | None] = {}
         """By arm: last lines of its errors; None once an episode has ended without one."""
 
     def write(self, row: Row) -> None:
         if isinstance(row, AgentRow):
-            if row.arm not in self._known:  # every worker builds its own
-                self._store.write_agent(row)
-            self._known.add(row.arm)
+            self._write_agent(row)
             return
         if isinstance(row, RestartRow):
             self.discard(row.arm, row.episodes)
@@ -281,11 +280,34 @@ class _StoreWriter:
             self._tracker.episode(row.arm, row.result)
             self._check_repeated_errors(row.arm, row.result)
 
+    def _write_agent(self, row: AgentRow) -> None:
+        """Store what an agent says of itself, and hold to it the agents that other workers build for the same arm.
+
+        Raises:
+            StoreError: it says otherwise, such as one of other weights.
+        """
+        said = to_json(row.agent)
+        if self._known.get(row.arm) == said:
+            return
+        try:
+            self._store.write_agent(row)
+        except StoreError as error:
+            if row.arm not in self._known:
+                raise
+            raise StoreError(
+                f"arm '{row.arm}': expected the same agent from every worker, got different ones: {error}. Files, "
+                "weights and packages must be the same on all machines, and stay so during a run"
+            ) from error
+        self._known[row.arm] = said
+
     def discard(self, arm: str, episodes: Iterable[int]) -> None:
         episodes = list(episodes)
         self._store.discard(arm, episodes)
         for episode in episodes:
             self._tracker.forget(arm, episode)
+
+    def note(self, text: str) -> None:
+        self._tracker.note(text)
 
     def _check_repeated_errors(self, arm: str, result: EpisodeResult) -> None:
         """Stop a run whose arm begins with the same error several times: a mistake in the set-up, not bad luck."""

@@ -43,7 +43,7 @@ def parse_options(pairs: Sequence[str], factory: Callable[..., Any], flag: str) 
             value = f"[{value}]"
         default = parameters[name].default if name in parameters else None
         names_files = (name in FILES or re.search(r"\bPath\b", annotation)) and value != default
-        path = _make_absolute(value) if names_files else None
+        path = find_path(value) if names_files else None
         try:
             is_text = annotation.startswith("str") and not (value == "null" and "None" in annotation)
             options[name] = path or (value if is_text else parse_yaml(value))
@@ -52,8 +52,8 @@ def parse_options(pairs: Sequence[str], factory: Callable[..., Any], flag: str) 
     return options
 
 
-def _make_absolute(value: str) -> str | None:
-    """Return the absolute path of a file or folder that exists."""
+def find_path(value: str) -> str | None:
+    """Return the absolute path of a file or folder that exists; None for any other text."""
     try:
         path = Path(value).expanduser()
         return str(path.resolve()) if value and path.exists() else None

@@ -141,6 +141,10 @@ class Tracker:
         progress.count(result.status, result.metrics)
         self._board.show(arm, progress)
 
+    def note(self, text: str) -> None:
+        """Show a sentence that stays."""
+        self._board.note(text)
+
 
 class SilentBoard:
     """Displays nothing."""

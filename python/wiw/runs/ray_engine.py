@@ -15,7 +15,7 @@ import queue
 import secrets
 import sys
 import time
-from collections import deque
+from collections import Counter, deque
 from collections.abc import Iterable, Iterator, Mapping
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import suppress
@@ -27,8 +27,8 @@ from wiw.isolation.source import end_idle_processes
 from wiw.ray_cluster import connect_cluster, import_ray
 from wiw.runs.config import EngineConfig
 from wiw.runs.limits import Limits
+from wiw.runs.ray_servers import PLACE_SECONDS, LostServersError, ServerPool, describe_loss
 from wiw.runs.ray_servers import START_SECONDS as SERVER_SECONDS
-from wiw.runs.ray_servers import LostServersError, ServerPool, describe_loss
 from wiw.runs.rows import OutcomeRow
 from wiw.runs.servers import ask_servers, find_served, write_commands, write_vlm_commands
 from wiw.runs.workers import (
@@ -53,8 +53,9 @@ UNREACHABLE = ("connection", "unreachable")
 before them whose."""
 TOGETHER = 0.02
 """Seconds that an actor waits for more rows before it sends some."""
-START_SECONDS = 600.0
-"""Time that the cluster has for giving an actor its resources."""
+NOTICE = 30.0
+"""Seconds without any work until it is said what the cluster is waited for."""
+LOST_SERVER = "its server was lost"
 
 
 class EpisodeActor:
@@ -115,6 +116,8 @@ class _Lease:
     job: Job | None = None
     rows: Any = None
     """Ray's generator of references to rows; before the first job a reference to the actor's start."""
+    vlm: str | None = None
+    """Address of the language model's server that it asks, if the run has such servers."""
     unfinished: dict[int, Episode] = field(default_factory=dict)
     silence: Silence = field(default_factory=Silence)
 
@@ -161,16 +164,33 @@ class _ActorPool:
         self._cores = max(1, len(os.sched_getaffinity(0)) // max(1, self._size)) if is_own else 1
         """Cores of Ray's that an actor asks for, and uses: an equal share of a cluster that nobody else uses."""
         self._leases: list[_Lease] = []
-        self._begun = 0
-        """Actors so far."""
+        self._waited = 0.0
+        """Seconds without news and without any actor at work."""
         self._token = secrets.token_urlsafe()
         is_alone = config.address is None and len(ray.nodes()) == 1
         host = "127.0.0.1" if is_alone else None
         commands = write_commands(spec.task.build(), spec.agents, config) if config.servers else []
         self._models = ServerPool(ray, commands, host, self._token)
         self._vlms = ServerPool(ray, write_vlm_commands(spec.agents, config), host, self._token)
-        self._addresses: tuple[list[str], list[str]] = ([], [])
-        """Where the servers were when the actors began: of world models, and of language models."""
+        self._addresses: set[str] = set()
+        """Where the world model's servers were when the actors began."""
+        if is_own:
+            self._require_gpus()
+
+    def _require_gpus(self) -> None:
+        """Check that this machine has the GPUs without which nothing could begin: all servers, and one actor.
+
+        Raises:
+            InfrastructureError: it has not.
+        """
+        config = self._config
+        asked = config.servers * config.server_gpus + config.vlm_servers * config.vlm_server_gpus + config.worker_gpus
+        if asked and asked > (found := self._ray.cluster_resources().get("GPU", 0)) + 1e-6:
+            raise InfrastructureError(
+                f"the Ray cluster of this machine has {found:g} GPUs: expected at least {asked:g}, for the servers "
+                "(servers, vlm_servers) and one actor (worker_gpus) together. Ask for fewer, for a share of one (such "
+                "as server_gpus=0.5), or for a cluster that has them (address)"
+            )
 
     def run(self) -> None:
         for pool in (self._models, self._vlms):
@@ -186,14 +206,36 @@ class _ActorPool:
 
     def _place_jobs(self) -> None:
         """Start actors and lease jobs to those that have none; begin with new actors where a server has moved."""
-        if (now := (self._models.addresses, self._vlms.addresses)) != self._addresses:
+        if not (now := {*self._models.addresses}) <= self._addresses:
             self._withdraw_jobs()
-            self._addresses = now
-        for lease in self._leases:
-            if lease.rows is None and self._jobs:
+        self._addresses = now
+        for lease in [lease for lease in self._leases if self._has_lost_server(lease)]:
+            self._end(lease)
+            self._lease_again(lease, lease.unfinished)
+        for lease in [lease for lease in self._leases if lease.rows is None][: len(self._jobs)]:
+            if self._shares_crowded_server(lease):
+                self._end(lease)
+                self._leases.append(self._start())
+            else:
                 self._assign(lease)
         while len(self._leases) < self._size and self._jobs:
             self._leases.append(self._start())
+
+    def _has_lost_server(self, lease: _Lease) -> bool:
+        return lease.vlm is not None and lease.vlm not in self._vlms.serving
+
+    def _shares_crowded_server(self, lease: _Lease) -> bool:
+        """Return whether an actor asks a server that two more of them ask than another one, as of one that has come
+        back.
+        """
+        if lease.vlm is None:
+            return False
+        askers = self._count_askers()
+        return askers[lease.vlm] >= 2 + min(askers[server] for server in self._vlms.serving)
+
+    def _count_askers(self) -> Counter[str | None]:
+        """Return how many actors ask each server of the language model."""
+        return Counter(lease.vlm for lease in self._leases)
 
     def _await_news(self) -> None:
         """Wait for rows, starts and losses, and deal with what has come."""
@@ -201,11 +243,10 @@ class _ActorPool:
         waiting = [*(lease.rows for lease in self._leases if lease.rows), *servers]
         serves, began = self._models.serves and self._vlms.serves, time.monotonic()
         working = [lease for lease in self._leases if lease.job]
-        most = START_SECONDS if serves else SERVER_SECONDS + START_SECONDS
-        seconds = min(most, choose_tick(self._patience)) if working else most
+        most = PLACE_SECONDS if serves else SERVER_SECONDS + PLACE_SECONDS
+        seconds = min(most, choose_tick(self._patience) if working else NOTICE)
         ready, _ = self._ray.wait(waiting, timeout=seconds)
-        if not ready and not working:
-            raise InfrastructureError(self._describe_shortage(serves))
+        self._note_wait(0.0 if ready or working else seconds, most, serves)
         for pool in (self._models, self._vlms):
             pool.update_servers(ready)
         for lease in working:
@@ -215,15 +256,32 @@ class _ActorPool:
         for lease in [lease for lease in working if lease.silence.seconds > self._patience]:
             self._replace(lease, InfrastructureError(lease.silence.describe()))
 
+    def _note_wait(self, seconds: float, most: float, serves: bool) -> None:
+        """Note how long nothing has come while no actor was at work, and say once what is waited for.
+
+        Raises:
+            InfrastructureError: it has been `most` seconds.
+        """
+        before, self._waited = self._waited, self._waited + seconds if seconds else 0.0
+        if self._waited >= most:
+            raise InfrastructureError(self._describe_shortage(serves))
+        if before < NOTICE <= self._waited:
+            self._receiver.note(f"waiting for Ray: {self._describe_request(serves)}")
+
     def _describe_shortage(self, serves: bool) -> str:
+        what, seconds = ("actor", PLACE_SECONDS) if serves else ("server", SERVER_SECONDS + PLACE_SECONDS)
+        return f"no {what} could be started within {seconds:g} s: {self._describe_request(serves)}"
+
+    def _describe_request(self, serves: bool) -> str:
+        """Return what the cluster has to have for the next actor, or for the servers where these come first."""
         config = self._config
-        what, seconds = ("actor", START_SECONDS) if serves else ("server", SERVER_SECONDS + START_SECONDS)
-        gpus = config.worker_gpus if serves else max(config.server_gpus, config.vlm_server_gpus)
-        return (
-            f"no {what} could be started within {seconds:g} s: expected a Ray cluster with "
-            f"{'a free core' if self._cores == 1 else f'{self._cores} free cores'}"
-            f"{f' and {gpus:g} GPUs' if gpus else ''} for each; see `ray status`"
-        )
+        if serves:
+            cores = "a free core" if self._cores == 1 else f"{self._cores} free cores"
+            expected = f"{cores}{f' and {config.worker_gpus:g} GPUs' if config.worker_gpus else ''} for each actor"
+        else:
+            gpus = max(config.server_gpus * bool(config.servers), config.vlm_server_gpus * bool(config.vlm_servers))
+            expected = f"{gpus:g} free GPUs for each server, and weights that load in time"
+        return f"expected a Ray cluster with {expected}; see `ray status`"
 
     def stop(self) -> None:
         for lease in self._leases:
@@ -234,17 +292,16 @@ class _ActorPool:
     def _start(self) -> _Lease:
         resources = {"num_cpus": self._cores, "num_gpus": self._config.worker_gpus}
         kind = self._ray.remote(**resources, max_restarts=0, max_task_retries=0)(EpisodeActor)
-        actor = kind.remote(self._pickle_spec(), self._cores)
-        self._begun += 1
-        return _Lease(actor, rows=actor.prepare.remote())
+        vlm = min(self._vlms.serving, key=self._count_askers().__getitem__, default=None)
+        actor = kind.remote(self._pickle_spec(vlm), self._cores)
+        return _Lease(actor, rows=actor.prepare.remote(), vlm=vlm)
 
-    def _pickle_spec(self) -> bytes:
-        """Return what the next actor needs: all of the world model's servers, and one of the language model's."""
-        models, vlms = self._addresses
-        if not models and not vlms:
+    def _pickle_spec(self, vlm: str | None) -> bytes:
+        """Return what an actor needs that asks all of the world model's servers, and this one of the language model."""
+        models = self._models.addresses
+        if not models and vlm is None:
             return pickle_spec(self._spec)
         served = find_served(self._spec.agents, self._config.served).model if models else None
-        vlm = vlms[self._begun % len(vlms)] if vlms else None
         return pickle_spec(replace(self._spec, agents=ask_servers(self._spec.agents, served, models, vlm, self._token)))
 
     def _receive(self, lease: _Lease) -> None:
@@ -293,11 +350,11 @@ class _ActorPool:
         told = kind.rpartition("/")[2] in UNREACHABLE
         return told and bool(len(self._models) or len(self._vlms)) and job.attempt + 1 < TRIES
 
-    def _lease_again(self, lease: _Lease, episodes: Mapping[int, Episode]) -> None:
+    def _lease_again(self, lease: _Lease, episodes: Mapping[int, Episode], cause: str = LOST_SERVER) -> None:
         """Take episodes from a lease to run them again, by any actor."""
-        assert lease.job is not None
-        cause = "its server was lost"
-        self._jobs.extend(lease_again(lease.job, dict(episodes), self._receiver, TRIES, cause))
+        if lease.job is None:
+            return
+        self._jobs.extend(lease_again(lease.job, episodes, self._spec.live, self._receiver, TRIES, cause))
         lease.unfinished = {index: own for index, own in lease.unfinished.items() if index not in episodes}
 
     def _withdraw_jobs(self) -> None:
@@ -330,9 +387,12 @@ class _ActorPool:
         Raises:
             InfrastructureError: the actor was lost before it had a job, as any other in its place would be.
         """
-        self._leases.remove(lease)
-        self._ray.kill(lease.actor)  # where only its answer was lost, it would keep its core
-        cause = describe_loss(error)
+        self._end(lease)
         if lease.job is None:
             raise InfrastructureError(f"a Ray actor could not start: {error}") from error
-        self._jobs.extend(lease_again(lease.job, lease.unfinished, self._receiver, TRIES, cause))
+        self._lease_again(lease, lease.unfinished, describe_loss(error))
+
+    def _end(self, lease: _Lease) -> None:
+        """End an actor, also a lost one: where only its answer was lost, it would keep its core."""
+        self._leases.remove(lease)
+        self._ray.kill(lease.actor)

@@ -26,9 +26,11 @@ from wiw.runs.servers import ServerCommand
 from wiw.wire.address_book import ServerAddress, read_addresses
 
 TRIES = 3
-"""How often a server is started while no episode ends."""
+"""How often a server is started while no episode ends with it serving."""
 START_SECONDS = 1800.0
 """Time that a server has for loading its weights and announcing itself."""
+PLACE_SECONDS = 600.0
+"""Time that the cluster has for giving an actor its resources."""
 GLANCE = 0.1
 """Seconds between two looks whether it has."""
 SHOWN_BYTES = 2000
@@ -108,8 +110,10 @@ class _Server:
     """Where it serves, or did before it was lost."""
     node: str | None = None
     serves: bool = False
+    asked_at: float = 0.0
+    """When it was last asked to start, as `time.monotonic()` tells it."""
     lost: int = 0
-    """How often it was lost since an episode has ended."""
+    """How often it was lost since an episode has ended while it served."""
 
     @property
     def port(self) -> int:
@@ -129,6 +133,7 @@ class ServerPool:
     def __init__(self, ray: Any, commands: Iterable[ServerCommand], host: str | None, token: str) -> None:
         self._ray, self._host, self._token = ray, host, token
         self._servers = [_Server(command) for command in commands for _ in range(command.count)]
+        self._have_all_served = False
 
     def __len__(self) -> int:
         return len(self._servers)
@@ -139,9 +144,14 @@ class ServerPool:
         return [server.address for server in self._servers if server.address is not None]
 
     @property
+    def serving(self) -> list[str]:
+        """Addresses of the servers that serve at present."""
+        return [server.address for server in self._servers if server.serves and server.address is not None]
+
+    @property
     def serves(self) -> bool:
-        """Whether all servers serve."""
-        return all(server.serves for server in self._servers)
+        """Whether there is enough to work with: all servers at the beginning, and once all have served, any of them."""
+        return not self._servers or len(self.serving) >= (1 if self._have_all_served else len(self._servers))
 
     @property
     def refs(self) -> list[Any]:
@@ -154,11 +164,17 @@ class ServerPool:
             self._start(server)
 
     def update_servers(self, ready: Sequence[Any]) -> None:
-        """Deal with servers that have begun to serve, or are lost.
+        """Deal with servers that have begun to serve, are lost, or have not come back for too long.
 
         Raises:
             LostServersError: one was lost for the third time, and no other is left.
         """
+        self._receive_news(ready)
+        self._have_all_served |= all(server.serves for server in self._servers)
+        if self._have_all_served and self.serving:
+            self._give_up_absent()
+
+    def _receive_news(self, ready: Sequence[Any]) -> None:
         for server in [server for server in self._servers if server.ref in ready]:
             try:
                 found = self._ray.get(server.ref)
@@ -174,10 +190,17 @@ class ServerPool:
                     server.address, server.node = found
                     server.serves, server.ref = True, server.actor.wait.remote()
 
+    def _give_up_absent(self) -> None:
+        """Give up servers for which the cluster has had no place since they were lost: the others go on."""
+        now = time.monotonic()
+        for server in [server for server in self._servers if not server.serves]:
+            if now - server.asked_at > START_SECONDS + PLACE_SECONDS:
+                self._give_up(server)
+
     def note_progress(self) -> None:
-        """Note that an episode has ended: servers that are lost from now on have all their tries."""
+        """Note that an episode has ended: servers that serve, and are lost from now on, have all their tries."""
         for server in self._servers:
-            server.lost = 0
+            server.lost = 0 if server.serves else server.lost
 
     def stop(self) -> None:
         """End the servers."""
@@ -188,7 +211,7 @@ class ServerPool:
     def _start(self, server: _Server) -> None:
         if server.actor is None:
             server.actor = self._make_actor(server)
-        server.serves = False
+        server.serves, server.asked_at = False, time.monotonic()
         server.ref = server.actor.start.remote(server.port if server.lost < TRIES - 1 else 0)
 
     def _make_actor(self, server: _Server) -> Any:
@@ -207,15 +230,18 @@ class ServerPool:
         if server.lost < TRIES:
             self._start(server)
             return
-        if server.actor is not None:
-            self._ray.kill(server.actor)
-        self._servers.remove(server)
+        self._give_up(server)
         if not self._servers:
             command = shlex.join(["wiw", *server.command.arguments])
             raise LostServersError(
                 f"the last server was lost {TRIES} times without any episode finishing: {command}: {cause}. Fix it, "
                 "then `wiw resume`, with --retry-errors for the episodes that were using it"
             )
+
+    def _give_up(self, server: _Server) -> None:
+        if server.actor is not None:
+            self._ray.kill(server.actor)
+        self._servers.remove(server)
 
 
 def describe_loss(error: Exception) -> str:

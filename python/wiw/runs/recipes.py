@@ -31,6 +31,7 @@ from wiw.runs.sources import source_digests
 from wiw.suggestions import did_you_mean
 from wiw.tasks.base import Task
 from wiw.types import PRIMITIVES
+from wiw.wire.address_book import find_announcements
 from wiw.world_models.base import WorldModel, find_accepts
 
 PLACEBO, PLACEBO_MODEL = "placebo-", "warp"
@@ -43,6 +44,8 @@ ERROR, ERROR_MODEL = "error-", "oracle"
 """Beginning of the names of arms with an error, and the model that they use where nobody names one."""
 REFERENCES = ("none", "copy", "oracle")
 """Arms that reports know by name: no world model, floor and ceiling."""
+REMOTE = "remote:"
+"""Beginning of world models that servers compute, before their addresses or the folder that announces them."""
 ELSEWHERE = ("vlm", "cache", "prices", "concurrency", "timeout", "attempts", "patience")
 """Options of a policy that change no answer: where and how its language model is asked."""
 NO_LIMITS = Limits()
@@ -207,7 +210,7 @@ class AgentRecipe(AgentConfig):
                         for role, each in roles.items()
                     }
         named = self.model if isinstance(self.model, str) else ""
-        is_own = named in WORLD_MODELS.built_in or named.startswith("remote:")  # others may mean something else by it
+        is_own = named in WORLD_MODELS.built_in or named.startswith(REMOTE)  # others may mean something else by it
         options = _leave_out(self.model_options, "token") if is_own else self.model_options
         return replace(self, policy_options=policies, model_options=options)
 
@@ -290,14 +293,19 @@ class AgentRecipe(AgentConfig):
 
     @property
     def arm(self) -> str:
-        """Short name of the world model: "none", "warp", the class behind a path, or servers' hosts and ports."""
+        """Short name of the world model: "none", "warp", the class behind a path, or servers' hosts and ports, or the
+        folder in which they announce themselves.
+        """
         if self.model is None:
             return "none"
         if not isinstance(self.model, str):
             return (self.model if isinstance(self.model, type) else type(self.model)).__name__.lower()
         kind, scheme, _ = self.model.partition("://")
         hosts = ";".join(address.partition("://")[2] for address in self.model.split(","))
-        return f"{kind.partition(':')[0]}:{hosts}" if scheme else self.model.rpartition(":")[2]
+        if scheme:
+            return f"{kind.partition(':')[0]}:{hosts}"
+        name = self.model.rpartition(":")[2]
+        return Path(name).name if self.model.startswith(REMOTE) else name
 
     def find_space(self, task: Task) -> str:
         """Return the plan space: the agent's own, or the task's."""
@@ -687,7 +695,12 @@ def error_of(arm: str) -> tuple[str | None, str | None]:
 
 
 def absolute(model: str) -> str:
-    """`path.py:Class` with its path made absolute, so that it means the same in any folder; other names as they are."""
+    """`path.py:Class` and `remote:FOLDER` with their paths made absolute, so that they mean the same in any folder;
+    other names as they are.
+    """
+    if model.startswith(REMOTE):
+        folder = find_announcements(model.removeprefix(REMOTE))
+        return model if folder is None else f"{REMOTE}{folder}"
     if model.startswith(ISOLATED):
         return f"{ISOLATED}{absolute(model.removeprefix(ISOLATED))}"
     repeats, named = _split_repeat(model)

@@ -12,7 +12,7 @@ from wiw.errors import ArgumentError
 from wiw.loop.agent_spec import space_option
 from wiw.registry import WORLD_MODELS
 from wiw.runs.config import EngineConfig
-from wiw.runs.recipes import REFERENCES, AgentRecipe
+from wiw.runs.recipes import REFERENCES, REMOTE, AgentRecipe, absolute
 from wiw.tasks.base import Task
 from wiw.world_models.remote.model import DEADLINE, ServedModel
 
@@ -60,13 +60,12 @@ def find_served(agents: Mapping[str, Any], named: str | None) -> AgentRecipe:
     """
     recipes = [recipe for recipe in agents.values() if isinstance(recipe, AgentRecipe)]
     models = {
-        recipe.model
+        absolute(recipe.model)
         for recipe in recipes
-        if isinstance(recipe.model, str) and recipe.model not in REFERENCES and not recipe.model.startswith("remote:")
+        if isinstance(recipe.model, str) and recipe.model not in REFERENCES and not recipe.model.startswith(REMOTE)
     }
-    if named is None and len(models) == 1:
-        named = models.pop()
-    found = [recipe for recipe in recipes if isinstance(recipe.model, str) and recipe.model == named]
+    named = next(iter(models)) if named is None and len(models) == 1 else named and absolute(named)
+    found = [recipe for recipe in recipes if isinstance(recipe.model, str) and absolute(recipe.model) == named]
     if not found:
         raise ArgumentError(
             "servers: expected one of the arms' world models as --world-model or --served (served=), got "

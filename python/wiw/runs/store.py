@@ -10,7 +10,6 @@ from __future__ import annotations
 import json
 import math
 import os
-import re
 import sqlite3
 from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
 from contextlib import ExitStack, contextmanager, nullcontext, suppress
@@ -25,6 +24,7 @@ from wiw.file_systems import find_network
 from wiw.json_text import escape_surrogates
 from wiw.runs import configurations
 from wiw.runs.faults import explain_faults, find_remedy, write_resume_command
+from wiw.runs.hidden_secrets import hide_secrets
 from wiw.runs.judges import JudgedRow, JudgeRecord, apply_judge, find_judge
 from wiw.runs.migrations import OLDEST_READABLE, is_newer, migrate, show_as_current
 from wiw.runs.processes import describe_process
@@ -138,7 +138,7 @@ class RunStore:
             connection.execute(f"PRAGMA user_version = {SCHEMA_VERSION}")
             recorded = {"benchmark": benchmark.VERSION, **info}
             if "command" in recorded:
-                recorded["command"] = [_hide_secret(argument) for argument in recorded["command"]]
+                recorded["command"] = hide_secrets(recorded["command"])
             connection.execute(
                 "INSERT INTO run VALUES (1, ?, ?, ?, ?)", (created, version, to_json(config), to_json(recorded))
             )
@@ -921,15 +921,6 @@ def find_resume_command(run: str | Path) -> str:
     with suppress(StoreError), RunStore.read(run) as store:
         return store.resume_command
     return write_resume_command(store_path(run).parent)
-
-
-_SECRET = re.compile(r"(?<![\w-])(key|token)=[^,&\s]+")
-"""An option that is a secret of a server, as in `--policy-option key=...` and `--arms a=remote:...?token=...`."""
-
-
-def _hide_secret(argument: str) -> str:
-    """Return an argument of a command as reports may show it."""
-    return _SECRET.sub(r"\1=***", argument)
 
 
 def _format_now() -> str:

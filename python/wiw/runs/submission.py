@@ -18,7 +18,7 @@ import sys
 import time
 from collections.abc import Mapping, Sequence
 from contextlib import suppress
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from types import FrameType
 from typing import Annotated, Any, Literal
@@ -116,6 +116,36 @@ class ClusterConfig:
             "slurm_additional_parameters": {"requeue": True},
         }
         return {key: value for key, value in {**common, **slurm}.items() if value is not None}
+
+
+@dataclass(frozen=True, kw_only=True)
+class ServerConfig:
+    """Resources that the jobs of servers request instead of those of the shards, which run on other nodes.
+
+    Raises:
+        ArgumentError: a number out of range.
+    """
+
+    server_partition: Annotated[str | None, arg(metavar="NAME")] = None
+    """SLURM partition for the jobs of --servers and --vlm-servers. Default: --partition."""
+    server_cpus: Annotated[int | None, arg(metavar="N")] = None
+    """Cores per server."""
+    server_memory: Annotated[float | None, arg(metavar="GB")] = None
+    """Memory per server in gigabytes."""
+    server_constraint: Annotated[str | None, arg(metavar="FEATURES")] = None
+    """SLURM constraint on the nodes of servers."""
+
+    def make_jobs(self, shards: ClusterConfig, count: int, gpus: int) -> ClusterConfig:
+        """Return what an array of `count` servers asks for; all run at the same time, as shards wait for all."""
+        return replace(
+            shards,
+            partition=self.server_partition or shards.partition,
+            cpus=self.server_cpus,
+            memory=self.server_memory,
+            constraint=self.server_constraint,
+            parallel=count,
+            gpus=gpus,
+        )
 
 
 class JobCommand:

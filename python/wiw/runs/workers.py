@@ -3,7 +3,8 @@
 
 Workers are spawned, never forked: a forked child hangs in an OpenGL context it did not make. Each asks for one job at a
 time and sends rows back; this process alone writes them. A worker that dies takes no episode with it: what it had not
-finished is run once more, one episode at a time, and only an episode that kills its worker twice is recorded as failed.
+finished is run again, those episodes that were live one at a time, and only one during which a worker has died twice is
+recorded as failed.
 One that has a job and sends nothing for long is hung, in code that has no deadline of its own, and is killed.
 """
 
@@ -13,11 +14,12 @@ import os
 import pickle
 import signal
 import sys
+import threading
 import time
 from collections import deque
 from collections.abc import Iterable, Iterator, Mapping, Sequence
-from contextlib import contextmanager
-from dataclasses import dataclass, field
+from contextlib import contextmanager, suppress
+from dataclasses import dataclass, field, replace
 from multiprocessing import active_children, get_context
 from multiprocessing.connection import Connection, wait
 from types import FrameType
@@ -55,6 +57,9 @@ class ReportReceiver(Protocol):
 
     def discard(self, arm: str, episodes: Iterable[int]) -> None:
         """Note that these episodes are run again from their beginning."""
+
+    def note(self, text: str) -> None:
+        """Show a sentence about the run."""
 
 
 @dataclass(frozen=True)
@@ -169,7 +174,7 @@ def run_in_workers(spec: WorkerSpec, jobs: Iterable[Job], receiver: ReportReceiv
         Error: what a worker raised on purpose, such as a broken contract.
     """
     end_idle_processes()
-    pool = _WorkerPool(pickle_spec(spec), deque(jobs), receiver, workers, Limits(**spec.limits).patience)
+    pool = _WorkerPool(spec, deque(jobs), receiver, workers)
     try:
         pool.run()
     finally:
@@ -224,8 +229,9 @@ class _Worker:
 class _WorkerPool:
     """The parent's side: assigns jobs to workers, receives their rows, and replaces workers that died or hang."""
 
-    def __init__(self, spec: bytes, jobs: deque[Job], receiver: ReportReceiver, size: int, patience: float) -> None:
-        self._spec, self._jobs, self._receiver, self._patience = spec, jobs, receiver, patience
+    def __init__(self, spec: WorkerSpec, jobs: deque[Job], receiver: ReportReceiver, size: int) -> None:
+        self._spec, self._jobs, self._receiver, self._live = pickle_spec(spec), jobs, receiver, spec.live
+        self._patience = Limits(**spec.limits).patience
         self._size = min(size, len(jobs))
         self._workers: list[_Worker] = []
 
@@ -313,29 +319,33 @@ class _WorkerPool:
             )
         if worker.job is None:
             return
-        self._jobs.extend(lease_again(worker.job, worker.unfinished, self._receiver, TRIES, cause))
+        self._jobs.extend(lease_again(worker.job, worker.unfinished, self._live, self._receiver, TRIES, cause))
 
 
 def lease_again(
-    job: Job, unfinished: Mapping[int, Episode], receiver: ReportReceiver, tries: int, cause: str
+    job: Job, unfinished: Mapping[int, Episode], live: int, receiver: ReportReceiver, tries: int, cause: str
 ) -> list[Job]:
-    """Return jobs of one episode each for what a lost worker had not finished; record those without tries left.
+    """Return jobs for what a lost worker had not finished: one for each episode that was live, which has had a try, and
+    one for those that had not begun; record live ones without tries left.
 
     Args:
         job: that the worker had.
-        unfinished: its episodes that have not ended, by index.
+        unfinished: its episodes that have not ended, by index, in the order in which they begin.
+        live: how many are live at a time.
         receiver: discards what it was told of them, and records errors.
         tries: how often an episode is started.
         cause: why the worker was lost.
     """
     receiver.discard(job.arm, list(unfinished))
+    begun, waiting = list(unfinished.items())[:live], tuple(unfinished.items())[live:]
+    rest = [replace(job, episodes=waiting)] if waiting else []
     if job.attempt + 1 < tries:
-        return [Job(job.arm, (item,), attempt=job.attempt + 1) for item in unfinished.items()]
-    for index, episode in unfinished.items():
+        return [Job(job.arm, (item,), attempt=job.attempt + 1) for item in begun] + rest
+    for index, episode in begun:
         error = f"the worker process died {NUMBERS[tries]} on this episode, last: {cause}"
         result = EpisodeResult(index, episode.episode_id, episode.scene, "error", error=error, kind="worker")
         receiver.write(OutcomeRow(job.arm, result))
-    return []
+    return rest
 
 
 def _describe_exit(exit_code: int) -> str:
@@ -352,8 +362,17 @@ def _start(spec: bytes, workers: int) -> _Worker:
     with _share_threads(workers):
         process.start()
     theirs.close()
-    ours.send_bytes(spec)
+    own = Connection(os.dup(ours.fileno()), readable=False)  # no other thread closes it while it is written to
+    threading.Thread(target=_send_spec, args=(own, spec), daemon=True, name="wiw worker start").start()
     return _Worker(process, ours)
+
+
+def _send_spec(pipe: Connection, spec: bytes) -> None:
+    """Send a worker what it needs: a pipe takes no more than a part of it until the worker reads, and others start
+    meanwhile. One that has died is found by the end of its own pipe.
+    """
+    with pipe, suppress(OSError):
+        pipe.send_bytes(spec)
 
 
 @contextmanager

@@ -37,8 +37,6 @@ from wiw.world_models.remote.declaration import declaration
 from wiw.world_models.remote.limits import check_row, most_bytes
 
 PORT = 8765
-CLIENTS = 256
-"""Maximum number of connections at a time."""
 KNOWN_BYTES = 512 * 2**20
 """Maximum size in bytes of answers kept for clients that ask again."""
 AHEAD = 4
@@ -69,6 +67,7 @@ class Settings:
         certificate: PEM file, for wss.
         key: PEM file of its key, where that is not in `certificate`.
         grace: seconds for finishing the accepted rows once the server is to end.
+        clients: maximum number of connections at a time.
 
     Raises:
         ArgumentError: a number out of range, a host beyond this machine without a token, a key without a certificate.
@@ -82,6 +81,7 @@ class Settings:
     certificate: Path | None = None
     key: Path | None = None
     grace: float = 30.0
+    clients: int = 256
 
     def __post_init__(self) -> None:
         expectations = (
@@ -89,6 +89,7 @@ class Settings:
             (self.queue is None or self.queue >= 1, f"a queue of at least 1, got {self.queue}"),
             (self.window >= 0, f"a window of at least 0, got {self.window}"),
             (self.grace >= 0, f"a grace of at least 0 seconds, got {self.grace}"),
+            (self.clients >= 1, f"clients of at least 1, got {self.clients}"),
         )
         for holds, expected in expectations:
             if not holds:
@@ -225,8 +226,9 @@ class Server:
 
     def _admit(self, connection: ServerConnection, request: Request) -> Response | None:
         """Return the refusal of a client; None lets it in."""
-        if len(self._unanswered) >= CLIENTS:
-            return connection.respond(HTTPStatus.SERVICE_UNAVAILABLE, f"{CLIENTS} clients are already connected\n")
+        if len(self._unanswered) >= (most := self.settings.clients):
+            said = f"{most} clients are already connected; start more servers, or this one with a greater --clients\n"
+            return connection.respond(HTTPStatus.SERVICE_UNAVAILABLE, said)
         token = self.settings.token
         shown = request.headers.get_all("Authorization")
         if token and not (len(shown) == 1 and hmac.compare_digest(shown[0].encode(), f"Bearer {token}".encode())):

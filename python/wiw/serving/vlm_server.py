@@ -77,6 +77,8 @@ class VlmServer:
         self.requests: list[dict[str, Any]] = []
         """Bodies of the latest 1000 requests, without their images' data."""
         self.count = 0
+        self.was_asked = False
+        """Whether there has been any request."""
         self.serving = threading.local()
         """Its `connection` is the socket of the request that this thread serves."""
         self._asking, self._counting = _Queue(), threading.Lock()
@@ -150,7 +152,7 @@ class VlmServer:
     def attend(self) -> Iterator[None]:
         """Count a request as in flight as long as the context lasts."""
         with self._counting:
-            self._in_flight += 1
+            self._in_flight, self.was_asked = self._in_flight + 1, True
         try:
             yield
         finally:

@@ -17,6 +17,7 @@ from dataclasses import asdict, dataclass
 from pathlib import Path
 from urllib.parse import urlsplit, urlunsplit
 
+from wiw.errors import ArgumentError
 from wiw.files import atomic_file
 from wiw.json_text import parse_json
 
@@ -38,6 +39,12 @@ def name_reachable(address: str) -> str:
     return urlunsplit(split._replace(netloc=f"{platform.node()}:{split.port}"))
 
 
+def find_announcements(address: str) -> str | None:
+    """Return the folder or file in which servers announce themselves, from the root on; None for addresses."""
+    path = Path(address).expanduser()
+    return str(path.resolve()) if "://" not in address and (os.sep in address or path.is_dir()) else None
+
+
 def choose_server(place: Path, turn: int) -> ServerAddress:
     """Return one of the servers that are announced in a file or folder; the next `turn` gives the next one.
 
@@ -53,6 +60,16 @@ def choose_server(place: Path, turn: int) -> ServerAddress:
 def find_token(given: str | None, announcement: Path | None) -> str | None:
     """Return the secret of a server: the given one, that of the environment, or a random one if it is announced."""
     return given or os.environ.get("WIW_TOKEN") or (secrets.token_urlsafe() if announcement is not None else None)
+
+
+def require_announcement(file: Path | None) -> None:
+    """Check that clients will find an announcement.
+
+    Raises:
+        ArgumentError: in a folder they read .json files alone, and this is none.
+    """
+    if file is not None and file.suffix != ".json":
+        raise ArgumentError(f"--announce: expected a file such as {file}.json, got {file}: clients read .json files")
 
 
 @contextmanager

@@ -8,9 +8,11 @@ import os
 import re
 import signal
 import time
+from collections import deque
 from dataclasses import dataclass
 from multiprocessing import get_context
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import pytest
@@ -20,9 +22,10 @@ from test_crash import facts
 
 import wiw.errors
 from wiw import scenes
-from wiw.errors import ArgumentError
+from wiw.errors import ArgumentError, InfrastructureError
+from wiw.runs import workers
 from wiw.runs.limits import Limits
-from wiw.runs.workers import Silence
+from wiw.runs.workers import Job, Silence, WorkerSpec, lease_again
 from wiw.studies.evaluate import run_arms
 
 
@@ -31,10 +34,11 @@ class Mortal(LineAgent):
     """Its process is killed at every tenth episode, once."""
 
     markers: str = ""
+    every: int = 10
 
     def _decide(self, query: Any) -> Any:
         marker = Path(self.markers, str(query.key.episode))
-        if query.key.episode % 10 == 9 and not marker.exists():
+        if query.key.episode % self.every == self.every - 1 and not marker.exists():
             marker.touch()
             os.kill(os.getpid(), signal.SIGKILL)
         return super()._decide(query)
@@ -128,6 +132,54 @@ def test_a_worker_that_is_killed_and_leaves_a_child_is_replaced(tmp_path: Path) 
 def test_a_worker_that_is_told_to_end_is_named_by_the_signal(tmp_path: Path) -> None:
     log = run_arms(LineTask(), {"a": Leaving()}, 2, out=tmp_path / "run", progress=False, workers=2, live=1)
     assert all(re.search(r"died twice on this episode, last: SIGTERM", row["error"]) for row in log.episodes)
+
+
+def test_only_episodes_that_were_live_are_charged_with_the_loss_of_a_worker() -> None:
+    episodes, rows, discarded = dict(enumerate(LineTask().episodes(8))), list[Any](), list[Any]()
+    receiver: Any = SimpleNamespace(write=rows.append, discard=lambda arm, lost: discarded.append((arm, lost)))
+    unfinished = {index: episodes[index] for index in range(2, 8)}
+    jobs = lease_again(Job("a", tuple(episodes.items())), unfinished, 4, receiver, 2, "lost")
+    assert [([index for index, _ in job.episodes], job.attempt) for job in jobs] == [
+        ([2], 1),
+        ([3], 1),
+        ([4], 1),
+        ([5], 1),
+        ([6, 7], 0),
+    ]
+    assert discarded == [("a", [2, 3, 4, 5, 6, 7])] and not rows
+    assert lease_again(jobs[0], {2: episodes[2]}, 4, receiver, 2, "lost") == []
+    assert [row.result.episode for row in rows] == [2]
+
+
+def test_an_episode_that_began_once_survives_two_lost_workers(tmp_path: Path) -> None:
+    """Each kills its worker once, and there are two in a job."""
+    (tmp_path / "markers").mkdir()
+    agent = Mortal(markers=str(tmp_path / "markers"), every=1)
+    log = run_arms(LineTask(), {"a": agent}, 8, out=tmp_path / "run", progress=False, workers=2, salt="", live=1)
+    assert len(list((tmp_path / "markers").iterdir())) == 8
+    assert [row["status"] for row in log.episodes] == ["done"] * 8
+
+
+def end_soon(pipe: Any, parent: int) -> None:
+    """Stand in for a worker that dies while it imports."""
+    time.sleep(1.5)
+    os._exit(3)
+
+
+def test_workers_start_at_the_same_time_and_a_dead_one_is_said_however_much_they_are_sent(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """A pipe takes 200 kB; the rest waits until the worker reads."""
+    monkeypatch.setattr(workers, "_run_worker", end_soon)
+    episodes = LineTask().episodes(20000)
+    spec = WorkerSpec(None, {}, 0, "", 1, frozenset(), episodes=episodes)
+    jobs = deque(Job("a", (item,)) for item in list(enumerate(episodes))[:2])
+    pool = workers._WorkerPool(spec, jobs, SimpleNamespace(), 2)  # type: ignore[arg-type]
+    assert len(pool._spec) > 1e6
+    with pytest.raises(InfrastructureError, match=r"could not start \(exit code 3\).*if __name__ == '__main__'"):
+        pool.run()
+    assert len(pool._workers) == 1, "the other one had been started, too"
+    pool.stop()
 
 
 def test_agents_may_start_processes_in_workers_which_end_with_these(tmp_path: Path) -> None:

@@ -5,11 +5,14 @@ import pytest
 
 import wiw
 from wiw.cli import main
+from wiw.cli.parts import AgentFlags
 from wiw.errors import ArgumentError, RegistryError
+from wiw.loop.config import AgentConfig
 from wiw.runs.arm_text import ArmText, parse_arm, split_arms
-from wiw.runs.recipes import AgentRecipe, arm_recipes, make_arm_absolute
+from wiw.runs.recipes import AgentRecipe, absolute, arm_recipes, make_arm_absolute
 from wiw.studies.run_log import load_run
 
+TASK = "imagenav"
 MODEL = """
 from pathlib import Path
 
@@ -144,3 +147,41 @@ def test_arms_in_one_text_are_those_of_the_command_line():
     text = "none,copy,small=warp?size=[144, 256]"
     assert arm_recipes(AgentRecipe("matcher"), text) == arm_recipes(AgentRecipe("matcher"), split_arms(text))
     assert list(arm_recipes(AgentRecipe("matcher"), text)) == ["none", "copy", "small"]
+
+
+def test_announced_servers_are_named_from_the_root_on_so_that_any_folder_will_do(tmp_path, monkeypatch):
+    """The arm is named by their folder, however it is written."""
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "servers").mkdir()
+    folder = f"remote:{tmp_path}/servers"
+    for given in ("remote:servers", "remote:./servers", folder):
+        assert absolute(given) == folder and AgentRecipe("matcher", folder).arm == "servers"
+        assert make_arm_absolute(f"a=heuristic+{given}?patience=9") == f"a=heuristic+{folder}?patience=9"
+    assert absolute("placebo-shuffled:remote:servers") == f"placebo-shuffled:{folder}"
+    assert (
+        absolute("remote:later/") == f"remote:{tmp_path}/later"
+    )  # a slash tells that it is a folder, and will be there
+    for kept in ("remote:ws://a:1,ws://b:2", "remote:host"):
+        assert absolute(kept) == kept
+    flags = AgentFlags(policy="heuristic", world_model="remote:servers")
+    assert flags.make_recipe(TASK, None, AgentConfig()).to_json()["model"] == folder
+
+
+@pytest.mark.parametrize("kind", ["transformers", "replay", "remote"])
+def test_places_of_language_models_are_named_from_the_root_on(kind, tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "place").mkdir()
+    by_flag = AgentFlags(policy="vlm", vlm=f"{kind}:place")
+    by_option = AgentFlags(policy="vlm", policy_option=(f"vlm={kind}:place",))
+    for flags in (by_flag, by_option):
+        recipe = flags.make_recipe(TASK, None, AgentConfig())
+        assert recipe.policy_options["vlm"]["vlm"] == f"{kind}:{tmp_path}/place"
+    roles = AgentFlags(policy="vlm", policy_option=(f'roles={{answer: {{vlm: "{kind}:place", model: big}}}}',))
+    asked = roles.make_recipe(TASK, None, AgentConfig()).policy_options["vlm"]["roles"]
+    assert asked == {"answer": {"vlm": f"{kind}:{tmp_path}/place", "model": "big"}}
+
+
+@pytest.mark.parametrize("name", ["transformers:org/model", "transformers:", "http://localhost:8000/v1", "mock"])
+def test_names_of_language_models_stay(name):
+    recipe = AgentFlags(policy="vlm", vlm=name).make_recipe(TASK, None, AgentConfig())
+    assert recipe.policy_options["vlm"]["vlm"] == name

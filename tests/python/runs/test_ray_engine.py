@@ -9,7 +9,7 @@ import subprocess
 import sys
 import time
 from collections import deque
-from contextlib import suppress
+from contextlib import nullcontext, suppress
 from dataclasses import dataclass
 from types import SimpleNamespace
 
@@ -263,6 +263,74 @@ def test_an_episode_that_a_lost_server_has_cost_is_leased_again(monkeypatch, kin
     assert sorted(row.result.episode for row in rows) == [0, 1, 2]
     assert sum(row.result.status == "error" for row in rows) == errors
     assert sum(1 in dict(job.episodes) for each in made for job in each.jobs) == begun
+
+
+def make_pool(monkeypatch, episodes, serving, size=2, **played):
+    """A pool whose actors ask servers of a language model; `serving` are the addresses of those that serve."""
+    started, killed = [], []
+
+    def start(spec, threads):
+        run = SimpleNamespace(options=lambda **options: SimpleNamespace(remote=lambda job: f"rows of {job.episodes}"))
+        started.append(SimpleNamespace(prepare=SimpleNamespace(remote=lambda: "started"), run=run))
+        return started[-1]
+
+    given = {"nodes": lambda: [{}], "exceptions": EXCEPTIONS, "kill": killed.append, **played}
+    remote = lambda **options: lambda kind: SimpleNamespace(remote=start)  # noqa: E731
+    items = enumerate(LineTask().episodes(episodes))
+    jobs, spec = deque(Job("none", (item,)) for item in items), WorkerSpec(None, {}, 0, "", 4, frozenset())
+    notes = []
+    receiver = SimpleNamespace(discard=lambda arm, lost: None, note=notes.append)
+    monkeypatch.setattr(ray_engine.ServerPool, "serving", property(lambda pool: serving if pool is found._vlms else []))
+    monkeypatch.setattr(ray_engine._ActorPool, "_pickle_spec", lambda pool, vlm: b"")
+    found = ray_engine._ActorPool(
+        SimpleNamespace(remote=remote, **given), spec, jobs, receiver, size, EngineConfig(engine="ray")
+    )
+    return found, started, killed, notes
+
+
+def test_actors_are_moved_from_a_lost_server_of_the_language_model_and_spread_again_once_it_is_back(monkeypatch):
+    serving = ["a", "b"]
+    pool, started, killed, _ = make_pool(monkeypatch, 12, serving, size=4)
+    pool._place_jobs()
+    assert [lease.vlm for lease in pool._leases] == ["a", "b", "a", "b"]
+    for lease in pool._leases:
+        lease.rows = None
+    pool._place_jobs()
+    assert all(lease.job is not None for lease in pool._leases) and len(pool._jobs) == 8
+    bound = [lease.actor for lease in pool._leases if lease.vlm == "b"]
+    serving.remove("b")
+    pool._place_jobs()
+    assert killed == bound and [lease.vlm for lease in pool._leases] == ["a"] * 4
+    assert len(pool._jobs) == 10 and [job.attempt for job in pool._jobs][-2:] == [1, 1], "a try of what was live"
+    serving.append("b")
+    for lease in pool._leases:
+        lease.rows = lease.job = None
+    pool._place_jobs()
+    assert sorted(lease.vlm for lease in pool._leases) == ["a", "a", "b", "b"] and len(started) == 8
+
+
+def test_what_the_cluster_lacks_is_said_once_and_then_ends_the_run(monkeypatch):
+    monkeypatch.setattr(ray_engine, "NOTICE", 0.2)
+    monkeypatch.setattr(ray_engine, "PLACE_SECONDS", 0.9)
+    waits = []
+    wait = lambda waiting, timeout: waits.append(timeout) or ([], waiting)  # noqa: E731
+    pool, _, _, notes = make_pool(monkeypatch, 2, [], wait=wait)
+    with pytest.raises(
+        InfrastructureError, match=r"no actor could be started within 0\.9 s: .*with a free core for each"
+    ):
+        pool.run()
+    assert notes == ["waiting for Ray: expected a Ray cluster with a free core for each actor; see `ray status`"]
+    assert len(waits) == 5
+
+
+@pytest.mark.parametrize(("gpus", "asked"), [(1.5, None), (1.25, "expected at least 1.5")])
+def test_gpus_that_this_machine_has_not_are_not_waited_for(gpus, asked):
+    played = SimpleNamespace(nodes=lambda: [{}], cluster_resources=lambda: {"GPU": gpus}, exceptions=EXCEPTIONS)
+    spec = WorkerSpec(TaskInMemory(LineTask()), {"none": AgentRecipe("heuristic", "warp")}, 0, "", 4, frozenset())
+    config = EngineConfig(engine="ray", servers=2, server_gpus=0.5, worker_gpus=0.5)
+    for is_own in (False, True):
+        with pytest.raises(InfrastructureError, match=asked) if is_own and asked else nullcontext():
+            ray_engine._ActorPool(played, spec, deque([None]), None, 1, config, is_own)
 
 
 def test_an_episode_that_kills_every_actor_is_an_error_after_three_tries(ray, tmp_path):

@@ -11,7 +11,7 @@ from locations import PYTHON_TESTS
 from run_facts import list_facts
 from test_ray_servers import run_walk
 
-from wiw.runs import ray_servers
+from wiw.runs import ray_engine, ray_servers
 
 pytestmark = pytest.mark.nightly
 
@@ -51,4 +51,24 @@ def test_a_lost_node_takes_its_actor_and_its_server_with_it_and_nothing_else(clu
     monkeypatch.setattr(ray_servers.ServerPool, "note_progress", remove_once)
     run_walk(tmp_path / "run", engine="ray", workers=2, live=2, servers=2, server_gpus=1).close()
     assert len(set(removed[0])) == 2, "a server on each node, for each has one GPU"
+    assert list_facts(tmp_path / "run") == list_facts(tmp_path / "here")
+
+
+def test_a_lost_node_that_nothing_replaces_ends_no_run(cluster, tmp_path, monkeypatch):
+    """Its server has no place any more, and neither has its actor: the others do the work."""
+    monkeypatch.setattr(ray_engine, "SERVER_SECONDS", 60.0)
+    monkeypatch.setattr(ray_engine, "PLACE_SECONDS", 30.0)
+    run_walk(tmp_path / "here").close()
+    removed, note = [], ray_servers.ServerPool.note_progress
+
+    def remove_once(pool):
+        note(pool)
+        if not removed and len(pool):
+            removed.append([server.node for server in pool._servers])
+            (lost,) = [node for node in cluster.workers if node.node_id == pool._servers[0].node]
+            cluster.remove_node(lost)
+
+    monkeypatch.setattr(ray_servers.ServerPool, "note_progress", remove_once)
+    run_walk(tmp_path / "run", engine="ray", workers=2, live=2, servers=2, server_gpus=1).close()
+    assert len(set(removed[0])) == 2
     assert list_facts(tmp_path / "run") == list_facts(tmp_path / "here")

@@ -177,6 +177,82 @@ def test_a_server_whose_actor_ray_kills_is_started_again_three_times(monkeypatch
     assert len(made) == (ray_servers.TRIES if is_gone else 1) and killed == made
 
 
+class PlayedServers:
+    """Stands in for Ray: two servers that begin to serve once they are started, one of which is lost later."""
+
+    def __init__(self, monkeypatch):
+        self.exceptions = SimpleNamespace(RayError=RayError, RayTaskError=RayTaskError)
+        self.killed, self.answers, self.count = [], {}, 0
+        monkeypatch.setattr(ray_servers.ServerPool, "_make_actor", self.make)
+        commands = [ServerCommand(("serve", "warp"), 2, 1)]
+        self.pool = ray_servers.ServerPool(self, commands, None, "")
+        self.pool.start()
+
+    def make(self, server):
+        self.count += 1
+        number, name = self.count, f"actor {self.count}"
+        self.answers[f"{name} starts"] = (f"ws://host:{number}", f"node {number}")
+        refs = {"start": lambda port: f"{name} starts", "wait": lambda: f"{name} ends"}
+        return SimpleNamespace(name=name, **{each: SimpleNamespace(remote=make) for each, make in refs.items()})
+
+    def get(self, ref):
+        if ref.endswith("ends"):
+            raise RayError("its node was lost")
+        return self.answers[ref]
+
+    def kill(self, actor):
+        self.killed.append(actor.name)
+
+
+def test_a_run_begins_with_all_of_its_servers_and_goes_on_with_any_of_them(monkeypatch):
+    played = PlayedServers(monkeypatch)
+    pool = played.pool
+    pool.update_servers(["actor 1 starts"])
+    assert not pool.serves and pool.serving == ["ws://host:1"]
+    pool.update_servers(["actor 2 starts"])
+    assert pool.serves
+    pool.update_servers(["actor 1 ends"])
+    assert pool.serves and pool.serving == ["ws://host:2"] and len(pool) == 2
+    pool.update_servers(["actor 2 ends"])
+    assert not pool.serves and pool.serving == []
+    pool.update_servers(["actor 4 starts"])
+    assert pool.serves and pool.serving == ["ws://host:4"]
+
+
+def test_a_server_for_which_there_is_no_place_any_more_is_given_up_and_the_others_go_on(monkeypatch):
+    monkeypatch.setattr(ray_servers, "START_SECONDS", 0.1)
+    monkeypatch.setattr(ray_servers, "PLACE_SECONDS", 0.1)
+    played = PlayedServers(monkeypatch)
+    pool = played.pool
+    pool.update_servers(["actor 1 starts"])
+    time.sleep(0.3)
+    pool.update_servers([])
+    assert len(pool) == 2, "at the beginning all are waited for"
+    pool.update_servers(["actor 2 starts"])
+    pool.update_servers(["actor 1 ends"])
+    pool.update_servers([])
+    assert len(pool) == 2
+    time.sleep(0.3)
+    pool.update_servers([])
+    assert len(pool) == 1 and pool.serving == ["ws://host:2"] and played.killed[-1] == "actor 3"
+    pool.update_servers(["actor 2 ends"])
+    time.sleep(0.3)
+    pool.update_servers([])
+    assert len(pool) == 1, "the last one is waited for by the run"
+
+
+def test_a_server_that_never_comes_back_is_given_up_though_others_finish_episodes(monkeypatch):
+    played = PlayedServers(monkeypatch)
+    pool = played.pool
+    pool.update_servers(["actor 1 starts", "actor 2 starts"])
+    pool.update_servers(["actor 1 ends"])
+    played.get = lambda ref: (_ for _ in ()).throw(RayTaskError())
+    for _ in range(ray_servers.TRIES - 1):
+        pool.note_progress()
+        pool.update_servers(["actor 3 starts"])
+    assert pool.serving == ["ws://host:2"] and len(pool) == 1
+
+
 def test_a_lost_actor_of_a_server_is_replaced_and_its_address_kept(ray, reference, tmp_path, monkeypatch):
     """The node is still there, so the server comes back at the same port, and its workers find it again."""
     seen, receive = [], ray_servers.ServerPool.note_progress
@@ -387,13 +463,17 @@ def test_options_reach_a_served_model_as_they_are():
     assert parse_options([_format_option(*item) for item in given.items()], make, "--world-model-option") == given
 
 
-def test_servers_without_a_model_or_with_several_are_refused(tmp_path):
+def test_servers_without_a_model_or_with_several_are_refused(tmp_path, monkeypatch):
     agents = {"a": AgentRecipe("matcher", "warp"), "b": AgentRecipe("matcher", "warpnet"), "c": AgentRecipe("matcher")}
     with pytest.raises(ArgumentError, match="got none; the arms have warp, warpnet"):
         find_served(agents, None)
     with pytest.raises(ArgumentError, match="got svd"):
         find_served(agents, "svd")
     assert find_served(agents, "warpnet").model == "warpnet"
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "mine.py").touch()
+    for given, named in (("mine.py:M", f"{tmp_path}/mine.py:M"), (f"{tmp_path}/mine.py:M", "mine.py:M")):
+        assert find_served({**agents, "d": AgentRecipe("matcher", given)}, named).model == given
     other = {**agents, "d": AgentRecipe("matcher", "warp", model_options={"steps": 3})}
     with pytest.raises(ArgumentError, match="different options"):
         find_served(other, "warp")

@@ -19,9 +19,12 @@ import wiw
 from wiw import benchmark
 from wiw.errors import ArgumentError, ContractError, StoreError
 from wiw.runs import store as store_module
+from wiw.runs.execute import _StoreWriter
+from wiw.runs.hidden_secrets import hide_secrets
 from wiw.runs.judges import JudgedRow, JudgeRecord
+from wiw.runs.progress import SilentBoard, Tracker
 from wiw.runs.recipes import AgentRecipe
-from wiw.runs.rows import OutcomeRow, decision_row, decode_jpeg, encode_jpeg, outcome_row, strip, to_json
+from wiw.runs.rows import AgentRow, OutcomeRow, decision_row, decode_jpeg, encode_jpeg, outcome_row, strip, to_json
 from wiw.runs.run import Records
 from wiw.runs.store import SCHEMA_VERSION, RunStore
 from wiw.studies.run_log import load_run
@@ -351,6 +354,50 @@ def test_keys_and_tokens_of_servers_are_in_no_record(tmp_path):
     command = ["wiw", "run", "--policy-option", "key=SECRET", "--arms", "a=remote:ws://b?token=SECRET&patience=3,none"]
     with RunStore.create(tmp_path / "told", CONFIG, {**INFO, "command": command}, LineTask().episodes(1)) as store:
         assert store.info["command"][3:] == ["key=***", "--arms", "a=remote:ws://b?token=***&patience=3,none"]
+
+
+def test_workers_that_build_different_agents_end_the_run(run):
+    """As where the weights on another machine differ, or a file is replaced."""
+    writer = _StoreWriter(run, Tracker({}, 1, SilentBoard()))
+    for arm, weights in (("warp", "a"), ("none", "b"), ("warp", "a")):
+        writer.write(AgentRow(arm, {"model": {"weights": weights, "sizes": (1, 2)}}))
+    differ = 'arm \'warp\': expected the same agent from every worker, .*weights: the run has "a", now "b"'
+    with pytest.raises(StoreError, match=differ):
+        writer.write(AgentRow("warp", {"model": {"weights": "b", "sizes": (1, 2)}}))
+    assert {arm: said["model"]["weights"] for arm, said in run.info["built"].items()} == {"warp": "a", "none": "b"}
+
+
+@pytest.mark.parametrize(
+    ("given", "shown"),
+    [
+        (["--policy-option", "key=a,b&c d"], ["--policy-option", "key=***"]),
+        (["--world-model-option=token=a,b"], ["--world-model-option=token=***"]),
+        (["--arms", "a=svd?steps=3,token=b?token=c"], ["--arms", "a=svd?steps=3,token=b?token=***"]),
+        (["--token", "SECRET", "key"], ["--token", "***", "key"]),
+        (["--policy-option", "tries=2"], ["--policy-option", "tries=2"]),
+        (["--task-option", "categories=[bed, key]"], ["--task-option", "categories=[bed, key]"]),
+        (["remote:ws://b?token=SECRET&x", "{key: 'SECRET"], ["remote:ws://b?token=***&x", "{key: ***"]),
+    ],
+)
+def test_secrets_in_commands_are_hidden_whatever_they_consist_of(given, shown):
+    assert hide_secrets(given) == shown
+
+
+@pytest.mark.parametrize(
+    "roles",
+    [
+        '{answer: {vlm: "http://h/v1", model: mock, key: SECRET}}',
+        '{"answer": {"key": "SECRET", "model": "mock"}}',
+        "{answer: {? key : 'SECRET', model: mock}}",
+        '{answer: {"k\\x65y": SECRET}}',
+        "\nanswer:\n  model: mock\n  key: >\n    SECRET",
+        "{answer: &a {key: [SECRET, 1], again: *a}}",
+        "{[1, 2]: {key: SECRET}}",
+    ],
+)
+def test_keys_of_roles_are_hidden_however_they_are_written(roles):
+    option, text = hide_secrets(["--policy-option", f"roles={roles}"])
+    assert option == "--policy-option" and text.startswith("roles=") and "***" in text and "SECRET" not in text
 
 
 def test_records_become_data_frames(run):

@@ -24,11 +24,10 @@ from wiw.cli import main
 from wiw.cli.command_line import format_flags
 from wiw.cli.parts import AgentFlags, TaskFlags
 from wiw.cli.stop import LAST
-from wiw.cli.submit import SECRETS
 from wiw.errors import ArgumentError, DependencyError, InfrastructureError, StoreError
 from wiw.loop.config import AgentConfig
 from wiw.runs.config import RunConfig
-from wiw.runs.store import _hide_secret
+from wiw.runs.hidden_secrets import SECRETS, hide_secrets
 from wiw.runs.submission import (
     LOGS,
     PATIENCE,
@@ -352,7 +351,7 @@ def test_secrets_are_neither_printed_nor_written(tmp_path, capsys, variable, arg
 
 
 def test_what_submit_refuses_as_a_secret_stores_hide():
-    assert [_hide_secret(f"{name}=sk-1") for name in SECRETS] == [f"{name}=***" for name in SECRETS]
+    assert hide_secrets([f"{name}=sk-1" for name in SECRETS]) == [f"{name}=***" for name in SECRETS]
 
 
 def test_an_arm_may_be_named_like_a_secret(tmp_path, capsys):
@@ -360,9 +359,42 @@ def test_an_arm_may_be_named_like_a_secret(tmp_path, capsys):
     assert main(["submit", "imagenav", "--dry-run", "--shards", "1", "--out", str(tmp_path), *arms]) == 0
 
 
-def test_a_partition_of_no_servers_is_refused(tmp_path):
-    with pytest.raises(ArgumentError, match="--server-partition is for the jobs of --servers and --vlm-servers"):
-        submit(tmp_path / "run", "--server-partition", "gpu", "--debug")
+@pytest.mark.parametrize("flag", [("--server-partition", "gpu"), ("--server-memory", "8")])
+def test_resources_of_no_servers_are_refused(tmp_path, flag):
+    with pytest.raises(ArgumentError, match=f"{flag[0]} is for the jobs of --servers and --vlm-servers"):
+        submit(tmp_path / "run", *flag, "--debug")
+
+
+def test_servers_ask_for_resources_of_their_own_and_all_run_at_once(tmp_path, monkeypatch):
+    """Shards wait until all of them have begun; a server waits for them longer than it does without any of them."""
+    submitted = []
+
+    def submit_commands(folder, commands, config, name="wiw", after=()):
+        submitted.append((list(commands), config, len(after)))
+        return [SubmittedJob("slurm", f"7_{place}", tuple(own)) for place, own in enumerate(commands)]
+
+    monkeypatch.setattr("wiw.runs.submission.submit_commands", submit_commands)
+    asked = ["--shards", 8, "--parallel", 2, "--memory", 4, "--cpus", 3, "--constraint", "small", "--account", "lab"]
+    asked += ["--partition", "cpu", "--servers", 4, "--server-partition", "gpu", "--server-memory", 64]
+    made = ["--policy", "heuristic", "--world-model", "warp", "--episodes", 8, "--out", tmp_path / "run"]
+    assert main(["submit", TASK, *map(str, [*made, *asked])]) == 0
+    (servers, own, _), (shards, theirs, begun) = submitted
+    assert (len(servers), own.parallel, own.partition, own.gpus, own.account) == (4, 4, "gpu", 1, "lab")
+    assert (own.memory, own.cpus, own.constraint) == (64, None, None)
+    assert (len(shards), theirs.parallel, theirs.memory, theirs.cpus, begun) == (8, 2, 4, 3, 4)
+    for command in servers:
+        idle, first = (float(command[command.index(flag) + 1]) for flag in ("--idle", "--await-first"))
+        assert idle <= 3600 and first >= 86400
+
+
+def test_a_model_in_a_file_is_served_whatever_folder_it_is_named_from(tmp_path, monkeypatch, capsys):
+    monkeypatch.chdir(tmp_path)
+    body = "accepts = wiw.accepts('trajectory', size=(8, 16))\n    rollout = None\n"
+    (tmp_path / "mine.py").write_text(f"import wiw\n\nclass M(wiw.WorldModel):\n    {body}")
+    asked = ["--policy", "heuristic", "--world-model", "mine.py:M", "--servers", "1", "--shards", "1", "--dry-run"]
+    assert main(["submit", TASK, *asked, "--out", str(tmp_path / "run")]) == 0
+    lines = [shlex.split(line)[1:] for line in capsys.readouterr().out.splitlines() if line.startswith("wiw serve ")]
+    assert [line[1] for line in lines] == [f"{tmp_path}/mine.py:M"]
 
 
 def test_servers_are_given_the_options_of_the_preset(tmp_path, capsys):

@@ -3,6 +3,7 @@
 
 from __future__ import annotations
 
+import asyncio
 import contextlib
 import gc
 import os
@@ -16,6 +17,7 @@ import time
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
 from itertools import chain
+from types import SimpleNamespace
 
 import msgpack
 import numpy as np
@@ -27,6 +29,8 @@ from websockets.sync.client import connect
 from websockets.sync.server import serve as serve_sync
 
 import wiw
+from wiw.cli import main
+from wiw.cli.serve import _end_if_idle
 from wiw.errors import ArgumentError, ContractError, InfrastructureError, RemoteError, RolloutError
 from wiw.loop import attempts
 from wiw.loop.attempts import Attempted
@@ -610,13 +614,36 @@ def test_no_web_page_may_ask():
         connect(server.address, origin="http://somewhere", proxy=None)
 
 
-def test_more_clients_than_a_server_takes(monkeypatch):
-    monkeypatch.setattr(serving, "CLIENTS", 1)
-    with serve_in_background(Plain()) as server:
+def test_more_clients_than_a_server_takes():
+    with serve_in_background(Plain(), clients=1) as server:
         client = Remote(server.address)
         with pytest.raises(InvalidStatus, match="503"):
             connect(server.address, proxy=None)
+        with pytest.raises(RemoteError, match=r"503: 1 clients are already connected; .*--clients"):
+            Remote(server.address, patience=0.5)
         client.close()
+
+
+@pytest.mark.parametrize("command", [["serve", "warp"], ["serve-vlm", "--model", "mock"]])
+def test_an_announcement_that_no_client_would_read_is_refused(command, tmp_path):
+    with pytest.raises(ArgumentError, match=r"expected a file such as .*/1\.json, got .*/1: clients read \.json"):
+        main([*command, "--port", "0", "--announce", str(tmp_path / "1"), "--idle", "0.1", "--debug"])
+
+
+@pytest.mark.parametrize(("served", "at_first"), [(False, 0.8), (True, 30.0)])
+def test_a_server_waits_for_its_first_client_longer_than_for_another_one(served, at_first):
+    """Its client, if there is one, leaves soon."""
+
+    async def wait():
+        ended, ready = asyncio.Event(), asyncio.Event()
+        server = SimpleNamespace(clients=int(served), end=ended.set)
+        ready.set()
+        asyncio.get_running_loop().call_later(0.15, setattr, server, "clients", 0)
+        await asyncio.wait_for(_end_if_idle(server, at_first, 0.2, ready), 20)
+        return ended.is_set()
+
+    begin = time.monotonic()
+    assert asyncio.run(wait()) and (served or time.monotonic() - begin >= at_first)
 
 
 @pytest.mark.parametrize(

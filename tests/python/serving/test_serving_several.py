@@ -9,6 +9,7 @@ import os
 import socket
 import threading
 import time
+import warnings
 from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
@@ -314,6 +315,61 @@ def test_another_model_is_refused_at_the_start() -> None:
     nameless = "several servers can only be used for a model that can be identified"
     with pytest.raises(RemoteError, match=nameless), serve(Counting(""), Counting("")):
         pass
+
+
+def test_one_server_that_answers_is_enough_to_begin_and_the_other_joins_later(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(links, "JOIN", 0.3)
+    port, model = find_free_port(), Counting()
+    with (
+        serve_in_background(model) as server,
+        contextlib.closing(Remote(f"ws://127.0.0.1:{port},{server.address}")) as client,
+    ):
+        assert client.accepts.best_batch >= 2 * Counting.accepts.best_batch
+        ask_within(client, 20.0, make_rows(8))
+        assert model.rows == 8
+        late, starts = Counting(), itertools.count(100, 10)
+
+        def has_joined() -> bool:
+            ask_within(client, 20.0, make_other_rows(8, next(starts)))
+            return late.rows >= 4
+
+        with serve_in_background(late, port=port):
+            wait_for(has_joined)
+        assert len({*model.seeds, *late.seeds}) == model.rows + late.rows, "no row is computed twice"
+
+
+@pytest.mark.parametrize(
+    ("name", "said"), [("other", "serves a different model than ws://"), ("", "can be identified")]
+)
+def test_a_server_that_joins_later_is_held_to_the_first(monkeypatch: pytest.MonkeyPatch, name: str, said: str) -> None:
+    monkeypatch.setattr(links, "JOIN", 0.3)
+    port, wrong = find_free_port(), Counting(name)
+    with (
+        serve_in_background(Counting()) as server,
+        contextlib.closing(Remote(f"{server.address},ws://127.0.0.1:{port}")) as client,
+    ):
+        with serve_in_background(wrong, port=port) as other, warnings.catch_warnings(record=True) as told:
+            warnings.simplefilter("always")
+            for start in itertools.count(0, 10):
+                ask_within(client, 20.0, make_other_rows(8, start))
+                if told and start >= 30:
+                    break
+            assert other.clients == 1 and wrong.rows == 0
+        (warning,) = told
+        assert said in str(warning.message) and "It is not asked" in str(warning.message)
+
+
+def test_servers_of_which_none_answers_are_all_named() -> None:
+    ports = [find_free_port(), find_free_port()]
+    addresses = ",".join(f"ws://127.0.0.1:{port}" for port in ports)
+    with pytest.raises(RemoteError, match=f"nobody serves a world model: .*{ports[0]}: .*; .*{ports[1]}: ") as caught:
+        Remote(addresses, patience=0.5)
+    assert caught.value.kind == "connection"
+
+
+def find_free_port() -> int:
+    with socket.create_server(("127.0.0.1", 0)) as found:
+        return int(found.getsockname()[1])
 
 
 def test_without_any_server_the_call_ends_at_its_deadline(monkeypatch: pytest.MonkeyPatch) -> None:

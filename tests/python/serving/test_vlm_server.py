@@ -729,6 +729,20 @@ def test_the_command_announces_where_it_serves_and_ends_when_nobody_asks(tmp_pat
     assert problems == [None] * 6 and not file.exists() and signal.getsignal(signal.SIGTERM) == before
 
 
+@pytest.mark.parametrize("was_asked", [False, True])
+def test_a_server_waits_for_its_first_request_longer_than_for_another_one(was_asked: bool) -> None:
+    from wiw.cli.serve_vlm import _wait_for_end
+
+    with VlmServer(MockClient()) as server:
+        assert not server.was_asked
+        if was_asked:
+            assert connect(server.url, attempts=1).model == "mock" and server.was_asked
+        begin = time.monotonic()
+        _wait_for_end(server, (30.0 if was_asked else 0.8, 0.15))
+        seconds = time.monotonic() - begin
+        assert seconds < 20 if was_asked else seconds >= 0.8
+
+
 def test_a_request_in_flight_keeps_a_server_from_being_idle() -> None:
     gate, asked = threading.Event(), threading.Event()
 

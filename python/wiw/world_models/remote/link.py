@@ -43,6 +43,9 @@ BREACHES = frozenset({"type", "dtype", "nan", "shape", "frames", "frame 0", "cha
 FROM_MODEL = BREACHES | {"raised"}
 """Kinds of refusals that say that the model has returned; the others come from a server whose model hangs, too."""
 
+MOST_REASON = 500
+"""Bytes of a server's words that an error shows."""
+
 Frames = NDArray[np.uint8]
 
 
@@ -92,13 +95,17 @@ class Link:
         Raises:
             RemoteError: nobody has answered in time, or the server refuses.
         """
-        self._call_soon(self._wanted.set)
         try:
-            return self._welcome.result(seconds)
+            return self.greet().result(seconds)
         except LateError:
             raise RemoteError(
                 f"nobody serves a world model at {self.address}: {self.last_error}", "connection"
             ) from None
+
+    def greet(self) -> Future[Welcome]:
+        """Connect, for as long as that takes, and return what is served, once the server has said it."""
+        self._call_soon(self._wanted.set)
+        return self._welcome
 
     @property
     def is_connected(self) -> bool:
@@ -212,7 +219,7 @@ class Link:
                     self._fail_all(
                         RemoteError(f"{self.address} expects a different token: set WIW_TOKEN to it", "token")
                     )
-                self.last_error = f"{self.address}: {error}"
+                self.last_error = f"{self.address}: {error}{_read_reason(error)}"
             except Exception as error:  # whatever it is, those who ask wait no longer than their deadlines
                 self.last_error = f"{type(error).__name__}: {error}"
             if not self._open and self._welcome.done():
@@ -383,6 +390,12 @@ class Link:
         for question in self._open.values():
             if not question.answer.done():
                 question.answer.set_exception(error)
+
+
+def _read_reason(error: InvalidStatus) -> str:
+    """Return what a server says of its refusal to connect, in its first line."""
+    said = (error.response.body or b"")[:MOST_REASON].decode("utf-8", "replace").strip().partition("\n")[0]
+    return f": {''.join(filter(str.isprintable, said))}" if said else ""
 
 
 def _error(refusal: Refusal) -> Exception:

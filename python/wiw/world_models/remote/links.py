@@ -10,7 +10,8 @@ from __future__ import annotations
 
 import math
 import time
-from collections.abc import Collection, Sequence
+import warnings
+from collections.abc import Callable, Collection, Sequence
 from concurrent.futures import FIRST_COMPLETED, wait
 from dataclasses import dataclass
 
@@ -18,6 +19,8 @@ from wiw.errors import RemoteError
 from wiw.wire.messages import Welcome
 from wiw.world_models.remote.link import Frames, Link, Question
 
+JOIN = 3.0
+"""Seconds that servers have to answer once another one has, before the first call is made without them."""
 LOST = 3.0
 """Seconds without a connection after which a server's rows are given to others."""
 PATIENCE = 0.5
@@ -35,10 +38,24 @@ class _Server:
 
     link: Link
     in_flight: int = 1
+    is_admitted: bool = False
+    """Whether it is known to serve what the others do."""
+    refusal: str = ""
+    """Why it is never asked, if it has joined with something else."""
     late_at: float = -math.inf
     """When it was last found late."""
     probed_at: float = -math.inf
     """When it was last asked for a row while it was late."""
+
+    @property
+    def is_reachable(self) -> bool:
+        """Whether it can be asked at present."""
+        return self.is_admitted and self.link.is_connected
+
+    @property
+    def fault(self) -> str:
+        """Why it could not be asked last, with its address."""
+        return self.refusal or f"{self.link.address}: {self.link.last_error}"
 
     @property
     def is_late(self) -> bool:
@@ -47,7 +64,8 @@ class _Server:
 
 
 class Links:
-    """Connections to servers of the same model; called as a `Link` is.
+    """Connections to servers of the same model; called as a `Link` is. One server is enough to begin with: others join
+    whenever they answer, and each is held to what the first one serves.
 
     Args:
         links: one for each server.
@@ -55,33 +73,71 @@ class Links:
 
     def __init__(self, links: Sequence[Link]) -> None:
         self._servers = [_Server(link) for link in links]
+        self._first: tuple[str, Welcome] | None = None
+        """Address and welcome of the server that the others are held to."""
 
     def welcome(self, seconds: float) -> Welcome:
-        """Return what all of them serve.
+        """Return what they serve, once one has answered; the others have `JOIN` more seconds to do so as well.
 
         Raises:
-            RemoteError: one has not answered in time, or refuses; "model" where one serves another model than the
-                first, or a model without a version, which cannot be distinguished from another.
+            RemoteError: none has answered in time; one refuses, or serves another model than the first ("model"), or a
+                model without a version, which cannot be distinguished from another.
         """
         give_up = time.monotonic() + seconds
-        found = [server.link.welcome(max(0.0, give_up - time.monotonic())) for server in self._servers]
-        first = found[0]
-        for server, welcome in zip(self._servers, found, strict=True):
-            if not welcome.fingerprint:
-                raise RemoteError(
-                    f"{server.link.address}: several servers can only be used for a model that can be identified: "
-                    f"{welcome.unknown or 'it has no version'}; give one address, or use one server",
-                    "model",
-                )
-            if (welcome.fingerprint, welcome.accepts) != (first.fingerprint, first.accepts):
-                raise RemoteError(
-                    f"{server.link.address} serves a different model than {self._servers[0].link.address}: fingerprint "
-                    f"{welcome.fingerprint}, expected {first.fingerprint}; serve the same weights and options",
-                    "model",
-                )
-            server.in_flight = welcome.in_flight
-        in_flight = sum(server.in_flight for server in self._servers)
+        greetings = [server.link.greet() for server in self._servers]
+        if not wait(greetings, seconds, FIRST_COMPLETED).done:
+            reasons = "; ".join(server.fault for server in self._servers)
+            raise RemoteError(f"nobody serves a world model: {reasons}", "connection")
+        wait(greetings, min(JOIN, max(0.0, give_up - time.monotonic())))
+        for server in self._servers:
+            self._admit(server)
+        assert self._first is not None
+        _, first = self._first
+        in_flight = sum(server.in_flight if server.is_admitted else first.in_flight for server in self._servers)
         return Welcome(first.accepts, first.model, first.fingerprint, first.unknown, in_flight)
+
+    def _admit(self, server: _Server) -> None:
+        """Admit a server if it has answered.
+
+        Raises:
+            RemoteError: as of `welcome`.
+        """
+        if server.is_admitted or not (greeting := server.link.greet()).done():
+            return
+        self._check(server.link.address, greeting.result())
+        server.in_flight, server.is_admitted = greeting.result().in_flight, True
+
+    def _admit_late(self) -> None:
+        """Admit the servers that have answered since the last call. One that serves something else is never asked, and
+        that is said: the others go on.
+        """
+        for server in [server for server in self._servers if not server.refusal]:
+            try:
+                self._admit(server)
+            except RemoteError as error:
+                server.refusal = str(error)
+                warnings.warn(f"{error}. It is not asked; the run goes on with the other servers", stacklevel=2)
+
+    def _check(self, address: str, welcome: Welcome) -> None:
+        """Check that a server serves the same model as the first.
+
+        Raises:
+            RemoteError: it does not, or cannot be held to it.
+        """
+        if not welcome.fingerprint:
+            raise RemoteError(
+                f"{address}: several servers can only be used for a model that can be identified: "
+                f"{welcome.unknown or 'it has no version'}; give one address, or use one server",
+                "model",
+            )
+        self._first = self._first or (address, welcome)
+        other, first = self._first
+        if (welcome.fingerprint, welcome.accepts) != (first.fingerprint, first.accepts):
+            raise RemoteError(
+                f"{address} serves a different model than {other}: fingerprint {welcome.fingerprint}, expected "
+                f"{first.fingerprint}; serve the same weights and options",
+                "model",
+            )
 
     def ask(self, rows: Sequence[bytes], give_up: float) -> list[Frames]:
         """Return the frames of each row, in order.
@@ -90,7 +146,7 @@ class Links:
             RemoteError, ContractError: as of `Link.ask`; a lost connection or a passed deadline only where no server
                 is left that answers.
         """
-        return _Call(self._servers, rows, give_up).run()
+        return _Call(self._servers, rows, give_up, self._admit_late).run()
 
     def close(self) -> None:
         """End the connections."""
@@ -105,10 +161,13 @@ class _Call:
         servers: those to ask.
         rows: as `pack_row` packs them.
         give_up: when to wait no longer, as `time.monotonic()` tells it.
+        admit: admits servers that have come.
     """
 
-    def __init__(self, servers: Sequence[_Server], rows: Sequence[bytes], give_up: float) -> None:
-        self._servers, self._rows, self._give_up = servers, rows, give_up
+    def __init__(
+        self, servers: Sequence[_Server], rows: Sequence[bytes], give_up: float, admit: Callable[[], None]
+    ) -> None:
+        self._servers, self._rows, self._give_up, self._admit = servers, rows, give_up, admit
         self._patience = PATIENCE * (give_up - time.monotonic())
         self._share = 0
         """Rows that a server gets at a time, if it takes as many."""
@@ -127,6 +186,7 @@ class _Call:
             while len(self._answers) < len(self._rows):
                 if time.monotonic() >= self._give_up:
                     raise self._build_error()
+                self._admit()
                 self._give_back_lost()
                 self._note_late()
                 self._hand_out()
@@ -162,7 +222,7 @@ class _Call:
         for server in self._servers:
             if not server.link.is_connected:
                 server.link.wake()
-        reachable = [server for server in self._servers if server.link.is_connected]
+        reachable = [server for server in self._servers if server.is_reachable]
         timely = [server for server in reachable if not server.is_late]
         chosen = timely or reachable
         if not chosen:
@@ -226,8 +286,8 @@ class _Call:
         for server in self._servers:
             if self._asked[server] and server.link.alive_at <= self._asked_at[server]:
                 server.late_at = time.monotonic()
-        if not any(server.link.is_connected for server in self._servers):
-            reasons = "; ".join(f"{server.link.address}: {server.link.last_error}" for server in self._servers)
+        if not any(server.is_reachable for server in self._servers):
+            reasons = "; ".join(server.fault for server in self._servers)
             return RemoteError(f"no server could be reached in time: {reasons}", "connection")
         missing = len(self._rows) - len(self._answers)
         asked = ", ".join(server.link.address for server in self._servers if self._asked[server])

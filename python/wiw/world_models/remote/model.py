@@ -9,7 +9,6 @@ import os
 import time
 import weakref
 from collections.abc import Sequence
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -17,6 +16,7 @@ from numpy.typing import NDArray
 
 from wiw.errors import ArgumentError, RemoteError
 from wiw.types import Conditioning, Control
+from wiw.wire.address_book import find_announcements
 from wiw.wire.rows import pack_row
 from wiw.world_models.base import Accepts, WorldModel, seconds_left
 from wiw.world_models.remote.declaration import parse_declaration, parse_description
@@ -41,8 +41,8 @@ class Remote(WorldModel):
 
     Args:
         address: "ws://HOST:PORT", or "wss://..." for a server behind TLS; several with commas between them share the
-            rows of each call, and continue without one that dies. Or a folder in which servers of the same model
-            announce themselves (`wiw serve --announce FOLDER/NAME.json`).
+            rows of each call, begin as soon as one of them answers, and continue without one that dies. Or a folder in
+            which servers of the same model announce themselves (`wiw serve --announce FOLDER/NAME.json`).
         token: the server's; None means that of the environment variable WIW_TOKEN. Announced servers say theirs.
         patience: seconds that the first connection may take; 15 if not given, 270 for servers that are announced.
 
@@ -54,7 +54,7 @@ class Remote(WorldModel):
 
     def __init__(self, address: str, token: str | None = None, patience: float | None = None) -> None:
         self._arguments = (address, token, patience)
-        folder, key = _find_folder(address), token if token is not None else os.environ.get(TOKEN)
+        folder, key = find_announcements(address), token if token is not None else os.environ.get(TOKEN)
         if patience is None:
             patience = PATIENCE if folder is None else PATIENCE_FOR_JOBS
         links = [Link(each, key) for each in (_check_addresses(address) if folder is None else [folder])]
@@ -128,12 +128,6 @@ class ServedModel(Remote):
     def describe(self) -> dict[str, Any]:
         """Return what the served model says of itself, less its source files: the run's manifest has them."""
         return {name: value for name, value in self._described.items() if name != "sources"}
-
-
-def _find_folder(address: str) -> str | None:
-    """Return the folder in which servers announce themselves; None for addresses."""
-    path = Path(address).expanduser()
-    return str(path.resolve()) if "://" not in address and (os.sep in address or path.is_dir()) else None
 
 
 def _check_addresses(text: str) -> list[str]:
