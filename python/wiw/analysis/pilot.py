@@ -77,7 +77,7 @@ def read_pilot(run: Run, arm: str, base: str) -> Pilot:
     for name in (arm, base):
         if name not in run.arms:
             raise ArgumentError(f"power: no arm '{name}' in {run.path}; it has {', '.join(run.arms)}")
-    done, _ = split_outcomes([arm, base], run.store.outcomes())
+    done, _ = split_outcomes([arm, base], [row for row in run.store.outcomes() if row["arm"] in (arm, base)])
     common = [i for i in sorted(set(done[arm]) & set(done[base])) if SUCCESS.name in done[arm][i]["metrics"]]
     if len(common) < 2:
         raise ArgumentError(

@@ -326,7 +326,7 @@ def summarise_run(run: Run) -> Summary:
         answers={arm: answers[arm] for arm in run.arms if arm in answers},
         choices={arm: choices[arm] for arm in run.arms if arm in choices},
         departures=read_departures(run.store.info),
-        looks=_describe_looks(run.store.info),
+        looks=_describe_looks(run),
         bets="" if units is None else describe_bets(episodes, units),
         noise=_measure_noise(run, outcomes),
         tiers=tiers,
@@ -353,7 +353,7 @@ def _describe_noise(noise: NoiseFloor) -> str:
     found, said = noise.difference, f"Noise floor: {noise.change} {noise.difference.base}"
     differing = found.wins + found.losses
     if not differing:
-        return f"{said} succeeds in the same {found.estimate.n} episodes. This makes no difference here."
+        return f"{said} has the same outcome in all {found.estimate.n} episodes. This makes no difference here."
     return (
         f"{said} differs from itself in {differing} of {found.estimate.n} episodes ({found.wins} won, {found.losses} "
         f"lost), SR by {show_estimate(found.estimate, signed=True)} points. A difference between arms that is no "
@@ -380,15 +380,22 @@ def _describe_doubtful(arm: str, doubtful: int, count: int) -> str:
     )
 
 
-def _describe_looks(info: Mapping[str, Any]) -> str:
+def describe_stop(run: Run) -> str:
+    """Return whether a run with a rule for stopping early has stopped, as a predicate."""
+    if "stopped" in (info := run.store.info):
+        return f"stopped at {info['stopped']['why']}"
+    return "was never stopped, as the rule held at no look" if run.complete else "has not been stopped so far"
+
+
+def _describe_looks(run: Run) -> str:
     """Return the rule by which a run was to stop early, and whether it did."""
+    info = run.store.info
     if "until" not in info:
         return ""
     rule = f"The run was checked every {info['until']['every']} episodes, to stop once {info['until']['rule']}."
-    ended = f"It stopped at {info['stopped']['why']}." if "stopped" in info else "It has not been stopped so far."
     return (
-        f"{rule} {ended} That interval is from a confidence sequence, and p from a betting test: both are "
-        "valid at any time. The intervals in the tables are for a number of episodes that is fixed in advance."
+        f"{rule} It {describe_stop(run)}. That interval is from a confidence sequence, and p from a betting test: both "
+        "are valid at any time. The intervals in the tables are for a number of episodes that is fixed in advance."
     )
 
 

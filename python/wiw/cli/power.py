@@ -3,7 +3,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
@@ -82,7 +83,7 @@ def power(
 
     if task == "all":
         points = difference if difference is not None or scenes is not None else 5.0
-        _print_table([plan_power(points, one.settings()) for one in pilots.values()], chance, list(pilots))
+        _print_tasks({name: partial(plan_power, points, one.settings()) for name, one in pilots.items()}, chance)
         return 0
     (found,) = pilots.values() or (None,)
     settings = {} if found is None else found.settings()
@@ -95,6 +96,27 @@ def power(
     fitting = [points for points in USUAL if usual["base"] + points + usual["losses"] <= 100] or USUAL[:1]
     _print_table([plan_power(points, settings) for points in fitting], chance)
     return 0
+
+
+def _print_tasks(plans: Mapping[str, Callable[[], Power]], chance: float) -> None:
+    """Print a line per task, and below it why there is none of a task.
+
+    Raises:
+        ArgumentError: there is none of any task.
+    """
+    from wiw.errors import ArgumentError
+
+    found, refused = {}, {}
+    for task, plan in plans.items():
+        try:
+            found[task] = plan()
+        except ArgumentError as error:
+            refused[task] = error
+    if not found:
+        raise next(iter(refused.values()))
+    _print_table([*found.values()], chance, [*found])
+    for task, error in refused.items():
+        print(f"{task}: {error}")
 
 
 def _find_pilots(task: str | None, run: Path | None, arms: str | None) -> dict[str, Pilot]:

@@ -113,7 +113,7 @@ def group_pairs(differences: Sequence[Difference]) -> Group | None:
     rows: dict[str, dict[str, Difference]] = {}
     for each in differences:
         rows.setdefault(f"{each.arm} - {each.base}", {})[each.metric] = each
-    return Group("Comparisons, paired by episode", "Arms", "Arm minus arm", rows) if rows else None
+    return Group("Comparisons, paired by episode", "Comparisons", "Arm minus arm", rows) if rows else None
 
 
 def _list_quality(table: QualityTable | None) -> dict[str, Any] | None:

@@ -52,9 +52,10 @@ def read_recipes(store: RunStore) -> tuple[TaskRecipe, dict[str, AgentRecipe]]:
     info = store.info
     if info["task"] is None or None in info["agents"].values():
         raise StoreError(
-            f"{store.path} was started with objects in memory, which cannot be rebuilt here; call the same "
-            "wiw.evaluate(..., out=..., resume=True) again. Runs started by name (wiw.runs.recipes.AgentRecipe, or "
-            "`wiw run`) can be resumed from anywhere"
+            f"{store.path} was started with objects in memory, which cannot be rebuilt here. To continue it, call the "
+            "same wiw.evaluate(..., out=..., resume=True) again. To resume it from elsewhere, to verify it or to blame "
+            "its failures, start it by names: wiw.evaluate('imagenav', AgentRecipe('matcher', 'warp')) of "
+            "wiw.runs.recipes, or `wiw run`"
         )
     return TaskRecipe(**info["task"]), {arm: AgentRecipe.from_json(recipe) for arm, recipe in info["agents"].items()}
 

@@ -94,11 +94,11 @@ class _Part:
         return RunStore.read(self.path)
 
 
-def merge(stores: Sequence[str | Path], out: str | Path, scratch: str | Path | None = None) -> Merged:
+def merge(stores: str | Path | Sequence[str | Path], out: str | Path, scratch: str | Path | None = None) -> Merged:
     """Merge the stores of shards, or of the same run in other places, into one run.
 
         wiw.merge(["/scratch/a/1", "/scratch/a/2"], out="runs/a")
-        wiw.merge(["runs/a"], out="runs/whole")        # all stores in subfolders of runs/a
+        wiw.merge("runs/a", out="runs/whole")        # all stores in subfolders of runs/a
 
     An episode found in several stores is taken from the first that has finished it without an error. Their records must
     be equal if that is guaranteed (built-in parts without weights, on machines of the same kind); otherwise differing
@@ -108,7 +108,7 @@ def merge(stores: Sequence[str | Path], out: str | Path, scratch: str | Path | N
     since.
 
     Args:
-        stores: folders with a store, or with subfolders that have one.
+        stores: folders with a store, or with subfolders that have one; a single one may be given by itself.
         out: folder of the merged run, on any disk; the store there is either complete or absent, or as it was.
         scratch: folder on a local disk in which it is written first; by default the system's temporary folder.
 
@@ -118,7 +118,7 @@ def merge(stores: Sequence[str | Path], out: str | Path, scratch: str | Path | N
             equality is guaranteed; `out` already holds another run.
         FileError: `out` or `scratch` cannot be written.
     """
-    parts = _read_parts(find_stores(stores))
+    parts = _read_parts(find_stores([stores] if isinstance(stores, str | Path) else stores))
     takes, repeated, unlike = _choose_sources(parts)
     with make_local_folder(scratch) as local, _choose_place(out, parts, local) as place:
         target = _begin_merged(place, parts, local)

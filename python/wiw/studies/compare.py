@@ -19,6 +19,7 @@ from wiw.analysis.summary import (
     Group,
     Summary,
     count_unbalanced,
+    describe_stop,
     role_of,
     select_metrics,
     split_outcomes,
@@ -149,7 +150,11 @@ def _compare_logs(
         both.baselines,
         both.marks,
         names,
-        (*unlike, *(line for pair in pairs for line in _describe_changes(first, second, pair))),
+        (
+            *unlike,
+            *(line for pair in pairs for line in _describe_changes(first, second, pair)),
+            *_describe_salts(first, second),
+        ),
         unbalanced=count_unbalanced(second),
         looks=_describe_looks(first, second, names),
         bets="" if units is None else describe_bets(episodes, units),
@@ -176,8 +181,8 @@ def _describe_looks(a: RunLog, b: RunLog, names: tuple[str, str]) -> str:
     found = []
     for log, name in zip((a, b), names, strict=True):
         if "until" in (info := log.store.info):
-            ended = f"it stopped at {info['stopped']['why']}" if "stopped" in info else "it has not been stopped so far"
-            found.append(f"{name} was checked as it ran, to stop once {info['until']['rule']}; {ended}.")
+            rule, ended = info["until"]["rule"], describe_stop(log)
+            found.append(f"{name} was checked as it ran, to stop once {rule}; it {ended}.")
     return " ".join(found)
 
 
@@ -336,6 +341,16 @@ def _describe_changes(a: RunLog, b: RunLog, pair: tuple[str, str]) -> list[str]:
     details = [f"{name} {to_json(described[0].get(name))} -> {to_json(described[1].get(name))}" for name in differing]
     more = f", and {len(details) - MOST_NAMED} more" if len(details) > MOST_NAMED else ""
     return [f"{label}: {', '.join(details[:MOST_NAMED])}{more}."]
+
+
+def _describe_salts(a: RunLog, b: RunLog) -> list[str]:
+    """Return that the runs drew different random numbers, if they did."""
+    if a.store.salt == b.store.salt:
+        return []
+    return [
+        "The runs have different salts, so policies and world models that draw random numbers drew different ones; to "
+        "compare with equal draws, give both runs the same --salt (salt=)."
+    ]
 
 
 def _describe_agent(log: RunLog, arm: str, built: bool) -> dict[str, Any]:

@@ -206,6 +206,11 @@ def _read_run(name: str, content: Any, shared: Mapping[str, Any], where: str) ->
     known = [field.name for field in fields(RunConfig) if field.name not in _OWN_SETTINGS]
     require_known(settings, known, f"{where}: settings")
     settings = read_values(RunConfig, settings, f"{where}: settings")
+    if quality is not None and settings.get("keep_images") == 0:
+        raise ArgumentError(
+            f"{where}: the plot 'quality' scores pictures, of which keep_images: 0 keeps none; leave the setting "
+            "out, or omit the plot"
+        )
     options = _require_mapping(content.get("task_options") or {}, f"{where}: task_options")
     task = TaskRecipe(str(content.get("task", "imagenav")), dict(options))
     return StudyRun(name, _give_seed(task, settings), agents, RunConfig(**settings), pairs, plots, quality)

@@ -136,7 +136,8 @@ def test_command_line(capsys):
 def test_a_pilot_says_how_many_episodes_the_next_run_needs(tmp_path, capsys):
     """Two arms of a run: won and lost, and how alike episodes of a scene are."""
     run = tmp_path / "run"
-    log = run_arms(LineTask(), {"mine": LineAgent(0.7), "warp": LineAgent(0.4)}, 60, out=run, progress=False)
+    arms = {"mine": LineAgent(0.7), "warp": LineAgent(0.4), "another": LineAgent(0.2)}
+    log = run_arms(LineTask(), arms, 60, out=run, progress=False)
     success = {arm: np.array([r["metrics"]["success"] for r in log.episodes if r["arm"] == arm]) for arm in log.arms}
     pilot = read_pilot(log, "mine", "warp")
     assert pilot.base == pytest.approx(100 * success["warp"].mean())
@@ -188,6 +189,10 @@ def test_two_models_five_points_apart_on_each_task(capsys):
     assert main(["power", "5", "--task", "all"]) == 0
     shown = capsys.readouterr().out
     assert all(task in shown for task in PILOTS)
+    assert main(["power", "--task", "all", "--scenes", "40"]) == 0
+    shown = capsys.readouterr().out
+    assert all(task in shown for task in PILOTS) and "manipulation: power: 40 episodes in 40 scenes" in shown
+    assert main(["power", "5", "--task", "all", "--chance", "2"]) == 2
     assert main(["power", "5", "--task", "imagenav"]) == 0
     shown = capsys.readouterr().out
     assert str(wiw.power(5, **PILOTS["imagenav"].settings())) in shown

@@ -257,7 +257,7 @@ def test_the_interval_at_the_stop_is_that_of_scenes_in_order(tmp_path):
 def test_a_run_that_is_never_sure_ends_with_its_episodes(tmp_path):
     log = run_arms(LineTask(), AGENTS, 12, out=tmp_path, until="width<1", look_every=5, progress=False)
     assert "stopped" not in log.store.info and len(log.episodes) == 24
-    assert "It has not been stopped so far" in " ".join(str(log.numbers()).split())
+    assert "It was never stopped, as the rule held at no look." in " ".join(str(log.numbers()).split())
 
 
 def test_an_interrupted_run_goes_on_to_the_same_stop(tmp_path, monkeypatch):

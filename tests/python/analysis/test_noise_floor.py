@@ -63,7 +63,7 @@ def test_the_report_says_how_much_an_arm_differs_from_itself(tmp_path, capsys):
     found = noise.difference
     assert (found.arm, found.base) == ("reseeded:none", "none") and found.wins + found.losses == differing
     (said,) = [note for note in notes(log.numbers()) if note.startswith("Noise floor")]
-    same = "succeeds in the same 24 episodes" in said
+    same = "has the same outcome in all 24 episodes" in said
     assert same if differing == 0 else f"in {differing} of 24 episodes" in said
     assert "Noise floor" in log.report().read_text()
     assert wiw.verify(tmp_path / "run", episodes=2).same
@@ -73,7 +73,7 @@ def test_the_report_says_how_much_an_arm_differs_from_itself(tmp_path, capsys):
     ("first", "again", "expected"),
     [
         ([0, 1, 0, 0, 0, 0], [1, 0, 1, 0, 0, 0], "3 of 6 episodes (2 won, 1 lost), SR by +16.7"),
-        ([0, 1, 0, 0, 0, 0], [0, 1, 0, 0, 0, 0], "the same 6 episodes"),
+        ([0, 1, 0, 0, 0, 0], [0, 1, 0, 0, 0, 0], "has the same outcome in all 6 episodes"),
     ],
 )
 def test_how_much_an_arm_differs_from_itself_is_said(first, again, expected):

@@ -140,7 +140,7 @@ def test_with_world_models_pictures_and_scene_maps(tmp_path, two_rooms):
     run("whole", live=2)
     for number in (1, 2):
         run(f"parts/{number}", shard=f"{number}/2", live=3)
-    wiw.merge([tmp_path / "parts"], tmp_path / "merged")
+    wiw.merge(str(tmp_path / "parts"), tmp_path / "merged")
     rows, config = read_rows(tmp_path / "merged")
     assert (rows, config) == read_rows(tmp_path / "whole")
     assert rows["image"] and rows["scene_map"]

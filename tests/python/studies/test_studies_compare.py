@@ -56,6 +56,13 @@ def test_it_says_what_differs_between_the_agents(runs):
     assert remarks[0] == "copy: the same agent in both runs." and remarks[2] == "warp: drive 0.4 -> 0.8."
 
 
+def test_it_says_where_random_numbers_differ(tmp_path):
+    for name, salt in (("one", "a"), ("two", "a"), ("three", "b")):
+        run_arms(LineTask(), {"warp": LineAgent(0.4)}, 4, out=tmp_path / name, progress=False, salt=salt)
+    assert "salt" not in " ".join(wiw.compare(tmp_path / "one", tmp_path / "two").remarks())
+    assert "give both runs the same --salt" in wiw.compare(tmp_path / "one", tmp_path / "three").remarks()[-1]
+
+
 def test_an_arm_that_was_not_begun_is_compared_as_it_was_configured(runs, tmp_path):
     stopped = tmp_path / "stopped"
     shutil.copytree(runs[0], stopped)
@@ -216,5 +223,7 @@ def test_a_run_that_a_rule_stopped_has_nothing_left_to_run(tmp_path):
         "warp · stopped": (10, 0),
     }
     whole, stopped = found.looks.split(" stopped was checked")
-    assert whole == "whole was checked as it ran, to stop once width<1; it has not been stopped so far."
+    assert (
+        whole == "whole was checked as it ran, to stop once width<1; it was never stopped, as the rule held at no look."
+    )
     assert stopped.startswith(" as it ran, to stop once width<100; it stopped at 10 of 20 episodes: none ")

@@ -168,6 +168,7 @@ def test_a_pair_of_arms_named_by_text_says_which_is_unknown(tmp_path: Path) -> N
             "[quality]\n    quality: {frames: many}",
             "quality: frames: expected a whole number, got 'many'",
         ),
+        ("[success, rollouts]", "[quality]", "here: the plot 'quality' scores pictures, of which keep_images: 0"),
         ("[success, rollouts]", "[quality]\n    quality: {frame: 8}", "quality: unknown name 'frame'.*mean frames"),
         (
             "[success, rollouts]",
@@ -201,7 +202,7 @@ def test_what_a_study_cannot_say_is_refused_with_its_place(own: Path, old: str, 
 
 
 def test_scorers_and_weights_are_looked_for_before_anything_runs(own: Path, tmp_path: Path) -> None:
-    text = own.read_text()
+    text = own.read_text().replace("keep_images: 0", "keep_images: 1")
     for options, error, said in (
         ("scorers: [no-such-command]", ScorerError, "no-such-command"),
         (f"lpips: {tmp_path}", WeightsError, "lpips"),
