@@ -47,9 +47,8 @@ std::string check_header(const dtMeshHeader& h) {
       return "the tile's bounds are damaged";
   }
   if (h.bmax[0] - h.bmin[0] < 1e-3f || h.bmax[2] - h.bmin[2] < 1e-3f) return "the tile's bounds are empty";
-  const bool sane = std::isfinite(h.walkableClimb) && std::isfinite(h.bvQuantFactor) && h.bvQuantFactor >= 0.f &&
-                    h.bvQuantFactor <= 1e6f;
-  return sane ? "" : "the tile header holds a damaged number";
+  const bool has_grid = h.bvQuantFactor == 0.f || (h.bvQuantFactor >= 1e-6f && h.bvQuantFactor <= 1e6f);
+  return std::isfinite(h.walkableClimb) && has_grid ? "" : "the tile header holds a damaged number";
 }
 
 template <class T>

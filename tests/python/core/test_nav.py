@@ -190,6 +190,7 @@ def test_damaged_files_are_refused_by_name(tmp_path, obstacle_course):
         good + b"\0": "1 bytes follow",
         good[:104] + b"\0" + good[105:]: "DNAV",
         good[:40] + np.float32(np.nan).tobytes() + good[44:]: "cell_size",
+        good[:200] + np.float32(9e-41).tobytes() + good[204:]: "header holds a damaged number",  # of the grid
     }
     for data, cause in cases.items():
         bad.write_bytes(data)
