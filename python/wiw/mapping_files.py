@@ -3,6 +3,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterable
 from copy import deepcopy
 from functools import lru_cache
 from pathlib import Path
@@ -12,6 +13,8 @@ from wiw.errors import FileError
 from wiw.json_text import parse_json
 
 TOO_DEEP = "expected less deeply nested lists and mappings"
+MERGE = "tag:yaml.org,2002:merge"
+"""Tag of the key `<<`, which takes in the keys of other mappings."""
 MOST_BRACKETS = 100
 """Open at once in a YAML file; PyYAML looks at all of them for each word, which takes seconds from a thousand on."""
 
@@ -24,7 +27,7 @@ def read_yaml_mapping(path: Path, expected: str) -> dict[str, Any]:
         expected: words for what it should hold.
 
     Raises:
-        FileError: it cannot be read, is no YAML, or no mapping.
+        FileError: it cannot be read, is no YAML, has a key twice, or is no mapping.
     """
     import yaml
 
@@ -43,7 +46,8 @@ def parse_yaml(text: str) -> Any:
     """Return the value of a YAML text.
 
     Raises:
-        ValueError: its lists and mappings are nested too deeply, or a value is none, such as the date 2026-13-40.
+        ValueError: its lists and mappings are nested too deeply, a mapping has a key twice, or a value is none, such as
+            the date 2026-13-40.
         yaml.YAMLError: it is no YAML.
     """
     try:
@@ -58,17 +62,39 @@ def parse_yaml(text: str) -> Any:
 def _parse_yaml_once(text: str) -> Any:
     import yaml
 
-    class ShallowLoader(yaml.SafeLoader):
+    class CarefulLoader(yaml.SafeLoader):
         def fetch_flow_collection_start(self, TokenClass: type) -> None:
             if self.flow_level == MOST_BRACKETS:
                 raise ValueError(TOO_DEEP)
             super().fetch_flow_collection_start(TokenClass)
 
-    loader = ShallowLoader(text)
+        def compose_mapping_node(self, anchor: Any) -> Any:
+            node = super().compose_mapping_node(anchor)  # before `<<` adds keys, which its own may override
+            words = [key for key, _ in node.value if isinstance(key, yaml.ScalarNode) and key.tag != MERGE]
+            _refuse_twice((self.construct_object(key), key.start_mark.line + 1) for key in words)
+            return node
+
+    loader = CarefulLoader(text)
     try:
         return loader.get_single_data()
     finally:
         loader.dispose()
+
+
+def _refuse_twice(keys: Iterable[tuple[Any, int]]) -> None:
+    """Refuse a mapping that has a key twice, of which PyYAML would keep the last.
+
+    Args:
+        keys: each with its line.
+
+    Raises:
+        ValueError: it does; names the key and its lines.
+    """
+    lines: dict[Any, int] = {}
+    for key, line in keys:
+        if key in lines:
+            raise ValueError(f"key '{key}' twice in one mapping, in lines {lines[key]} and {line}; leave one out")
+        lines[key] = line
 
 
 def read_json_object(path: Path, expected: str) -> dict[str, Any]:

@@ -15,7 +15,8 @@ import importlib
 import importlib.util
 import inspect
 import sys
-from collections.abc import Callable
+import weakref
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from functools import partial
 from hashlib import blake2b
@@ -61,6 +62,8 @@ class Registry:
     in a separate process; empty if external parts run in this one."""
     prefix: str = ""
     """Prefix of the names that go through the door; empty if all external parts do."""
+    factories: dict[str, str] = field(default_factory=dict)
+    """`module:class` of what a built-in factory makes, to its name: the class itself is not named in `built_in`."""
 
     def names(self) -> list[str]:
         """Return all registered names, built-in ones first."""
@@ -76,6 +79,21 @@ class Registry:
         if name in self.names() and name not in self.registered:
             raise RegistryError(f"the {self.kind} '{name}' already exists; choose another name")
         self.registered[name] = self._check_kind(name, thing)
+
+    def find_name(self, part: Any) -> str:
+        """Return the name of an instance or class: what it was made by, or is registered under; empty for any other."""
+        if made := find_options(part):
+            return made[0] or self._name_class(type(part))
+        return self._name_class(part if inspect.isclass(part) else type(part))
+
+    def _name_class(self, kind: type) -> str:
+        """Return the registered name of a class; one of wiw without a name has that of the class it derives from."""
+        plugins = {point.value: name for name, point in self._list_plugins().items()}
+        paths = {**plugins, **self.factories, **{path: name for name, path in self.built_in.items()}}
+        for base in kind.__mro__ if kind.__module__.startswith("wiw.") else (kind,):
+            if name := paths.get(f"{base.__module__}:{base.__qualname__}"):
+                return name
+        return next((name for name, thing in self.registered.items() if thing is kind), "")
 
     def find(self, name: str) -> Any:
         """Return the class or factory behind a name or path.
@@ -144,7 +162,11 @@ class Registry:
         return self._require_fitting(what, self.find(what) if isinstance(what, str) else what, options)
 
     def _make(self, what: Any, found: Any, options: dict[str, Any]) -> Any:
-        return self._check_kind(what, self._construct(what, found, options) if _makes(found) else found)
+        if not _makes(found):
+            return self._check_kind(what, found)
+        made = self._check_kind(what, self._construct(what, found, options))
+        _note_options(made, what if isinstance(what, str) else "", options)
+        return made
 
     def _require_fitting(self, what: Any, found: Any, options: dict[str, Any]) -> Any:
         if _makes(found):
@@ -191,6 +213,25 @@ class Registry:
         raise RegistryError(
             f"'{name}' is not a {self.kind}: expected a class derived from wiw.{attribute}, got {thing!r}"
         )
+
+
+_MADE: dict[int, tuple[weakref.ref[Any], str, dict[str, Any]]] = {}
+"""What registries have made and is still in use, by identity: its name, empty for a class, and its options."""
+
+
+def find_options(part: Any) -> tuple[str, Mapping[str, Any]] | None:
+    """Return name (empty for a class) and options by which a registry made a part; None for one made otherwise."""
+    made = _MADE.get(id(part))
+    return made[1:] if made and made[0]() is part else None
+
+
+def _note_options(part: Any, name: str, options: dict[str, Any]) -> None:
+    """Keep what a part was made with, as long as it is in use."""
+    place = id(part)
+    try:
+        _MADE[place] = weakref.ref(part, lambda _: _MADE.pop(place, None)), name, options
+    except TypeError:  # None, or a class whose instances cannot be referred to
+        return
 
 
 def _makes(thing: Any) -> bool:
@@ -286,6 +327,7 @@ WORLD_MODELS = Registry(
     },
     "wiw.world_models.base:WorldModel",
     door="wiw.isolation.models:find_isolated_model",
+    factories={"wiw.world_models.copy:Copy": "copy", "wiw.world_models.oracle:Oracle": "oracle"},
 )
 ISOLATED = "isolated:"
 """Prefix of the name of a policy that is to run in a separate process."""
@@ -312,6 +354,7 @@ POLICIES = Registry(
     "wiw.policies.base:Policy",
     door="wiw.isolation.policies:find_isolated_policy",
     prefix=ISOLATED,
+    factories={"wiw.policies.vlm.policy:VLM": "vlm"},
 )
 TASKS = Registry(
     "task",

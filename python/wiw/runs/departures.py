@@ -5,7 +5,7 @@ from __future__ import annotations
 
 import inspect
 from collections.abc import Iterator, Mapping
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -13,9 +13,9 @@ from wiw.loop.config import AgentConfig
 from wiw.mapping_files import read_yaml_mapping
 from wiw.policies.vlm.prompt_import.importer import CARD
 from wiw.policies.vlm.prompts.templates import DEFAULT, SETS, Prompts
-from wiw.registry import POLICIES
-from wiw.runs.recipes import ELSEWHERE, REFERENCES, AgentRecipe, find_control
-from wiw.runs.rows import to_json
+from wiw.registry import POLICIES, WORLD_MODELS, Registry
+from wiw.runs.ready_parts import read_options, same_value
+from wiw.runs.recipes import ELSEWHERE, REFERENCES, AgentRecipe, find_control, unwrap
 from wiw.tasks import presets
 from wiw.tasks.base import Task
 from wiw.tasks.presets import PAPER, Preset
@@ -74,17 +74,18 @@ def find_departures(task: Task, agents: Mapping[str, Any], episodes: int | None 
     """
     if task.name not in EPISODES:
         return ()
-    recipes = [recipe.without_secrets() for recipe in agents.values() if isinstance(recipe, AgentRecipe)]
+    own = [recipe for recipe in agents.values() if isinstance(recipe, AgentRecipe)]
+    recipes = [named.without_secrets() for recipe in own for named in _name_objects(task, recipe)]
     paper = _load_protocol(task, recipes)
     count = task.default_episodes if episodes is None else episodes
     found = [*_compare_rules(task, paper), *_compare_episodes(task, count)]
-    found += [Departure("agent", "of another method")] if len(recipes) < len(agents) else []
+    found += [Departure("agent", "of another method")] if len(own) < len(agents) else []
     for recipe in recipes:
         found += [*_compare_agent(task, recipe), *_compare_vlm(task, recipe, paper), *_compare_model(task, recipe)]
     settings = {*paper.rules, *_get_vlm_defaults()}  # a reason for one counts where its value is another
     for who in _list_concerned(recipes):
-        own = task.departures.get(who, {})
-        found += [Departure(topic, "", why) for topic, why in own.items() if topic not in settings]
+        reasons = task.departures.get(who, {})
+        found += [Departure(topic, "", why) for topic, why in reasons.items() if topic not in settings]
     return tuple(dict.fromkeys(found))
 
 
@@ -96,6 +97,56 @@ def describe_departures(task: Task, agents: Mapping[str, Any], episodes: int) ->
 def read_departures(manifest: Mapping[str, Any]) -> tuple[Departure, ...]:
     """Return the departures that a run's manifest names; none for a run from before they were recorded."""
     return tuple(Departure(each["topic"], each["found"], each["reason"]) for each in manifest.get("departures", ()))
+
+
+def _name_objects(task: Task, recipe: AgentRecipe) -> Iterator[AgentRecipe]:
+    """Yield the agent with names and options in place of the objects that have a name: once, or once for the policy and
+    once for the reviser where both are the same one with other options.
+    """
+    recipe = _name_model(task, recipe)
+    parts = (recipe.policy, recipe.reviser)
+    names = [part if part is None or isinstance(part, str) else _find_name(POLICIES, part) or part for part in parts]
+    named = replace(recipe, policy=names[0], reviser=names[1])
+    read = [
+        {name: _read_policy(task, part)} if isinstance(name, str) and not isinstance(part, str) else {}
+        for name, part in zip(names, parts, strict=True)
+    ]
+    is_one = isinstance(names[0], str) and isinstance(names[1], str) and names[0] == names[1]
+    for options in read if is_one else [{**read[0], **read[1]}]:
+        yield replace(named, policy_options={**recipe.policy_options, **options})
+
+
+def _name_model(task: Task, recipe: AgentRecipe) -> AgentRecipe:
+    """Return the agent with name and options in place of a world model that is an object and has a name."""
+    model = unwrap(recipe.model)
+    name = "" if model is None or isinstance(model, str) else _find_name(WORLD_MODELS, model)
+    if not name:
+        return recipe
+    return replace(
+        recipe,
+        model=name,
+        model_options=read_options(WORLD_MODELS, model, presets.get_options(task.model_options, name)),
+    )
+
+
+def _find_name(registry: Registry, part: Any) -> str:
+    """Return the name of an object of wiw; empty for one of a user's, which says itself what it is."""
+    name = registry.find_name(part)
+    return "" if not name or registry.is_foreign(name) else name
+
+
+def _read_policy(task: Task, policy: Any) -> dict[str, Any]:
+    """Return the options of a policy that is an object and has a name."""
+    name = POLICIES.find_name(policy)
+    paper = presets.load_preset(presets.find_owner(type(task)), PAPER).policies
+    names = [
+        *presets.get_options(task.policy_options, name),
+        *paper.get(name, {}),
+        *(("prompts", *SILENT) if name == "vlm" else ()),
+    ]
+    options = read_options(POLICIES, policy, names)
+    used = getattr(policy, "prompts", None)
+    return {**options, "prompts": used.source} if isinstance(used, Prompts) else options
 
 
 def _load_protocol(task: Task, recipes: list[AgentRecipe]) -> Preset:
@@ -176,9 +227,9 @@ def _compare_vlm(task: Task, recipe: AgentRecipe, paper: Preset) -> Iterator[Dep
 
 def _compare_model(task: Task, recipe: AgentRecipe) -> Iterator[Departure]:
     """Yield options of the world model that a preset sets and the run has otherwise, and how often it is asked."""
-    theirs = task.model_options.get(str(recipe.model), {})
+    theirs = presets.get_options(task.model_options, str(recipe.model))
     for name, value in recipe.model_options.items():
-        if name in theirs and name != "weights" and to_json(value) != to_json(theirs[name]):
+        if name in theirs and name != "weights" and not same_value(value, theirs[name]):
             yield Departure(f"{recipe.model} {name}", f"{value} (preset: {theirs[name]})")
     if str(recipe.model).startswith("remote:") and task.model_options:
         yield Departure("options of a served world model", "", SERVED)

@@ -27,9 +27,11 @@ from wiw.runs.arm_text import EXAMPLE, ArmText, check_arm_name, parse_arm, split
 from wiw.runs.compose import Experiment, RunContext, compose, make_for_space, require_placebo
 from wiw.runs.limits import Limits
 from wiw.runs.part_options import parse_options
+from wiw.runs.ready_parts import require_preset
 from wiw.runs.sources import source_digests
 from wiw.suggestions import did_you_mean
 from wiw.tasks.base import Task
+from wiw.tasks.presets import get_options
 from wiw.types import PRIMITIVES
 from wiw.wire.address_book import find_announcements
 from wiw.world_models.base import WorldModel, find_accepts
@@ -48,6 +50,8 @@ REMOTE = "remote:"
 """Beginning of world models that servers compute, before their addresses or the folder that announces them."""
 ELSEWHERE = ("vlm", "cache", "prices", "concurrency", "timeout", "attempts", "patience")
 """Options of a policy that change no answer: where and how its language model is asked."""
+NO_RESULT = (*(name for name in ELSEWHERE if name != "vlm"), "key", "token")
+"""Options that an object need not share with a preset; `vlm` is the server whose model answers."""
 NO_LIMITS = Limits()
 NOTHING: Mapping[str, Any] = {}
 
@@ -153,11 +157,11 @@ class AgentRecipe(AgentConfig):
 
     def resolve_model_options(self, task: Task) -> dict[str, Any]:
         """Return what the world model is made with on a task: the options of its preset, and on top those given."""
-        return {**task.model_options.get(str(self.model), {}), **self.model_options}
+        return {**get_options(task.model_options, str(self.model)), **self.model_options}
 
     def resolve_policy_options(self, policy: str, task: Task) -> dict[str, Any]:
         """Return what a named policy is made with on a task, likewise."""
-        return {**task.policy_options.get(policy, {}), **self.policy_options.get(policy, {})}
+        return {**get_options(task.policy_options, policy), **self.policy_options.get(policy, {})}
 
     @property
     def config(self) -> AgentConfig:
@@ -254,15 +258,17 @@ class AgentRecipe(AgentConfig):
             if isinstance(part, str):
                 found |= {} if part in registry.built_in else source_digests(registry.find(part))
             elif part is not None:
-                found |= source_digests(_unwrap(part))
+                found |= source_digests(unwrap(part))
         return found
 
     def require(self, task: Task, episodes: int) -> None:
-        """Require that world model, policies, tracker and placebo are made for a run of so many episodes of a task.
+        """Require that world model, policies, tracker and placebo are made for a run of so many episodes of a task, and
+        those that are objects with the options that its preset has for them.
 
         Raises:
             ArgumentError: one of them is not.
         """
+        require_preset(task, (self.policy, self.reviser), unwrap(self.model), NO_RESULT)
         said = task.describe()
         if (self.tracker or self.tracker_options) and not said.get("categories"):
             raise ArgumentError(
@@ -343,9 +349,9 @@ class AgentRecipe(AgentConfig):
 
     def _make_policy(self, policy: Any, space: str, task: Task, more: Mapping[str, Any] = NOTHING) -> Any:
         """Return a policy with the options of its name, the task's and more; others are made with the agent."""
-        if not isinstance(policy, str) or not (more or policy in {*task.policy_options, *self.policy_options}):
+        options = {**self.resolve_policy_options(policy, task), **more} if isinstance(policy, str) else {}
+        if not options:
             return policy
-        options = {**self.resolve_policy_options(policy, task), **more}
         return POLICIES.make(policy, **{**space_option(POLICIES, policy, space), **options})
 
 
@@ -379,7 +385,7 @@ def _leave_out(options: Mapping[str, Any], *names: str) -> dict[str, Any]:
     return {name: value for name, value in options.items() if name not in names}
 
 
-def _unwrap(part: Any) -> Any:
+def unwrap(part: Any) -> Any:
     """Return the model or policy behind everything that wraps it."""
     model = part.model if isinstance(part, Imaginer) else part
     return model.unwrapped if isinstance(model, Policy | WorldModel) else model
@@ -438,7 +444,14 @@ class AgentInMemory:
         return dict(self.agent.describe())
 
     def require(self, task: Task, episodes: int) -> None:
-        """Require nothing: there is no world model to ask."""
+        """Require that parts of a `wiw.Agent` of one's own have the options of the task's preset; of another method,
+        nothing.
+
+        Raises:
+            ArgumentError: they have not.
+        """
+        if isinstance(self.agent, Agent):
+            require_preset(task, (self.agent.policy, self.agent.reviser), self.agent.model, NO_RESULT)
 
     def to_json(self) -> None:
         """Return nothing: an object in memory cannot be written down."""

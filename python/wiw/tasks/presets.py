@@ -8,7 +8,7 @@ policy: navigator     # which policy runs the task where none is named; the task
 decisions: 40         # rules of the task
 generator:            # rules that generated episodes satisfy
   farthest: 4.0
-policies:             # options of policies by name, where the command line gives no others
+policies:             # options of policies by name, where the command line gives no others; files are beside this one
   vlm: {history: 0}
 models:               # options of world models, likewise; or a YAML file beside this one
   wan2.1: {frames: 33}
@@ -25,6 +25,7 @@ from typing import Any, TypeVar
 
 from wiw.errors import ArgumentError
 from wiw.mapping_files import read_yaml_mapping
+from wiw.registry import ISOLATED, POLICIES, WORLD_MODELS, Registry
 from wiw.suggestions import did_you_mean
 from wiw.typed_values import read_values
 
@@ -61,7 +62,8 @@ def load_preset(task: str, preset: str | Path) -> Preset:
     """Return what a preset sets, by name or by the path of a YAML file.
 
     Raises:
-        ArgumentError: no such preset, or a section of another form; names the file.
+        ArgumentError: no such preset, a section of another form, or options of an unknown policy or world model; names
+            the file.
         FileError: a file cannot be read, or does not hold a mapping.
     """
     rules: dict[str, Any] = {}
@@ -75,11 +77,16 @@ def load_preset(task: str, preset: str | Path) -> Preset:
         policy = _read_policy(content, path) or policy
         rules |= _drop_header(content)
         generator |= _read_generator_rules(content, path)
-        _add_options(policies, _read_options(content, "policies", path))
-        _add_options(models, _read_options(content, "models", path))
+        _add_options(policies, _read_options(content, "policies", path, POLICIES))
+        _add_options(models, _read_options(content, "models", path, WORLD_MODELS))
         _add_options(reasons, _read_departures(content, path))
     given = {who: {topic: str(why) for topic, why in own.items() if why} for who, own in reasons.items()}
     return Preset(rules, generator, policies, models, policy, given)
+
+
+def get_options(options: Options, name: str) -> Mapping[str, Any]:
+    """Return the options of a part by name, or by `path.py:Class` as seen from here; none if there are none."""
+    return options.get(name, options.get(_place_file(name, Path.cwd()), {}))
 
 
 def list_presets(task: str) -> list[str]:
@@ -190,15 +197,37 @@ def _read_generator_rules(content: Mapping[str, Any], path: Path) -> Mapping[str
     return {str(name): value for name, value in rules.items()}
 
 
-def _read_options(content: Mapping[str, Any], section: str, path: Path) -> Options:
-    """Return a section with options of parts, from a separate file where it names one."""
+def _read_options(content: Mapping[str, Any], section: str, path: Path, registry: Registry) -> Options:
+    """Return a section with options of registered parts, from a separate file where it names one."""
     options = content.get(section, {})
     if isinstance(options, str):
         path = path.parent / options
         options = _read(path)
     if not isinstance(options, Mapping) or not all(isinstance(own, Mapping) for own in options.values()):
         raise ArgumentError(f"{path}: {section}: expected options by name, `NAME: {{option: 0}}`, got {options!r}")
-    return options
+    for name in map(str, options):
+        _require_part(name, registry, f"{path}: {section}")
+    return {_place_file(str(name), path.parent): own for name, own in options.items()}
+
+
+def _place_file(name: str, folder: Path) -> str:
+    """Return `path.py:Class` with its path made absolute, as seen from a folder; other names as they are."""
+    prefix = ISOLATED if name.startswith(ISOLATED) else ""
+    path, colon, kind = name.removeprefix(prefix).rpartition(":")
+    if not colon or not path.endswith(".py"):
+        return name
+    return f"{prefix}{(folder / Path(path).expanduser()).resolve()}:{kind}"
+
+
+def _require_part(name: str, registry: Registry, where: str) -> None:
+    """Check that a part is known by its name, or named with its file or module, which are looked at when it is made."""
+    path, colon, kind = name.rpartition(":")
+    if name in registry.built_in or (colon and path and kind) or name in (known := registry.names()):
+        return
+    raise ArgumentError(
+        f"{where}: no {registry.kind} is named '{name}'; expected path.py:Class or one of "
+        f"{', '.join(known)}.{did_you_mean(name, known)}"
+    )
 
 
 def _add_options(known: dict[str, dict[str, Any]], more: Options) -> None:

@@ -18,13 +18,16 @@ import wiw
 from recognition_file import a_file
 from wiw.cli import main
 from wiw.errors import ArgumentError, PromptError
+from wiw.policies.matcher.policy import Matcher
+from wiw.policies.vlm.policy import VLM
 from wiw.policies.vlm.prompt_images import resize_view
 from wiw.policies.vlm.prompt_import.importer import CARD, write_templates
 from wiw.policies.vlm.prompts.templates import Prompts
-from wiw.registry import POLICIES, WORLD_MODELS, task_class
+from wiw.registry import POLICIES, WORLD_MODELS, find_options, task_class
 from wiw.runs.compose import RunContext
 from wiw.runs.departures import EPISODES, find_departures
-from wiw.runs.recipes import AgentRecipe, TaskInMemory, TaskRecipe
+from wiw.runs.ready_parts import require_preset
+from wiw.runs.recipes import AgentRecipe, TaskInMemory, TaskRecipe, agent_recipe
 from wiw.tasks import presets
 from wiw.tasks.ar import AR
 from wiw.tasks.imagenav import ImageNav
@@ -34,6 +37,7 @@ from wiw.vlm.messages import Call
 from wiw.vlm.mock import MockClient
 from wiw.world_models.clips import Alignment
 from wiw.world_models.plan_text import make_template
+from wiw.world_models.warp import Warp
 
 SHIPPED = [(task, preset) for task in EPISODES for preset in presets.list_presets(task)]
 
@@ -283,6 +287,114 @@ def test_a_task_of_ones_own_has_no_protocol_to_depart_from() -> None:
 
     assert find_departures(LineTask(), {"arm": AgentRecipe("heuristic")}) == ()
     assert TaskInMemory(LineTask()).build().departures == {}
+
+
+# -- parts that were made before a run ---------------------------------------------------------------------------------
+
+
+class OwnAgent(wiw.Agent):
+    """Decides otherwise."""
+
+
+@pytest.fixture
+def own_preset(tmp_path: Path) -> Path:
+    path = tmp_path / "mine.yaml"
+    path.write_text(
+        "base: default\npolicies: {matcher: {gate: 0.1, imagined: 9.0}}\nmodels: {warp: {size: [72, 128]}}\n"
+    )
+    return path
+
+
+def require(task: Any, agent: Any) -> None:
+    agent_recipe(agent).require(task, 2)
+
+
+def test_objects_without_the_presets_options_are_refused(own_preset: Path, two_rooms: str, tmp_path: Path) -> None:
+    task, out = ImageNav(two_rooms, preset=own_preset), tmp_path / "run"
+    policy, model = wiw.policy("matcher"), wiw.world_model("warp")
+    with pytest.raises(
+        ArgumentError,
+        match=r"preset .*mine\.yaml sets gate, imagined of policy matcher, which this object was built without: write "
+        r'wiw\.Agent\("matcher", \.\.\.\).* or build it as wiw\.policy\("matcher", \.\.\., gate=0\.1, imagined=9\.0\)',
+    ):
+        wiw.evaluate(task, wiw.Agent(policy, model), 1, out=out, progress=False)
+    refused = r'mine\.yaml sets size of world model warp, .* wiw\.world_model\("warp", \.\.\., size=\[72, 128\]\)'
+    for agent in (wiw.Agent("matcher", model), wiw.Agent("matcher", Warp), wiw.Agent("matcher", Warp(size=None))):
+        with pytest.raises(ArgumentError, match=refused):
+            require(task, agent)
+    with pytest.raises(ArgumentError, match="sets gate, imagined of policy matcher"):
+        require(task, wiw.Agent("heuristic", "copy", reviser=policy))
+    with pytest.raises(ArgumentError, match="sets gate, imagined of policy matcher"):
+        require(task, OwnAgent("matcher", "copy"))
+    with pytest.raises(ArgumentError, match=refused):
+        wiw.evaluate(task, wiw.Agent("matcher"), 1, arms={"mine": model}, out=out, progress=False)
+    assert not out.exists()
+
+
+def test_names_and_objects_with_the_presets_options_or_their_own_values_run(own_preset: Path) -> None:
+    task, paper = (ImageNav("apartments:val", preset=preset) for preset in (own_preset, "paper"))
+    require(task, wiw.Agent("matcher", "warp"))
+    require(task, wiw.Agent(wiw.policy("matcher", gate=0.1, imagined=2), wiw.world_model("warp", size=(72, 128))))
+    require(task, wiw.Agent(Matcher(gate=0.1, imagined=9.0), Warp(size=(72, 128))))
+    require(task, wiw.Agent(wiw.policy("heuristic"), wiw.world_model("copy")))
+    require(task, OwnAgent(wiw.policy("matcher", gate=0.1, imagined=9.0), "copy"))
+    require(paper, wiw.Agent(wiw.policy("matcher"), wiw.world_model("warp")))
+
+
+@pytest.mark.parametrize("task", EPISODES)
+def test_the_default_preset_refuses_no_object(task: str, tmp_path: Path) -> None:
+    own = tmp_path / "own.yaml"
+    own.write_text("base: default\ncandidates: 2\n")
+    for preset in ("default", own):
+        for policy in (wiw.policy("matcher"), wiw.policy("vlm", vlm="mock")):
+            require_preset(task_class(task)(preset=preset), (policy,), wiw.world_model("warp"))
+
+
+def test_a_language_model_built_without_the_papers_images_is_refused() -> None:
+    paper, said = ImageNav("apartments:val", preset="paper"), "preset paper sets view_size of policy vlm"
+    for policy in (wiw.policy("vlm", vlm="mock"), VLM("mock"), wiw.policy("vlm", vlm="mock", task="imagenav")):
+        require(ImageNav("apartments:val"), wiw.Agent(policy))
+        with pytest.raises(ArgumentError, match=said):
+            require(paper, wiw.Agent(policy))
+    require(paper, wiw.Agent(wiw.policy("vlm", vlm="mock", view_size=384)))
+    require(paper, wiw.Agent(VLM("mock", view_size=384)))
+
+
+@pytest.mark.parametrize("make", [VLM, lambda vlm, **options: wiw.policy("vlm", vlm=vlm, **options)])
+def test_an_object_departs_as_the_same_agent_by_name_does(make: Any) -> None:
+    for preset, view in (("default", {}), ("paper", {"view_size": 384})):
+        task, own = ImageNav("apartments:val", preset=preset), {"vlm": "mock", "tries": 5, "prompts": "minimal", **view}
+        named = find_topics(task, model="warp", policy_options={"vlm": own})
+        assert find_topics(task, policy=make(**own), model=wiw.world_model("warp")) == named
+        assert {"prompts", "temperatures", "tries"} <= named.keys() and "policy" not in named
+
+
+def test_options_of_objects_are_compared_with_the_papers_and_the_presets() -> None:
+    task = AR("apartments:val")
+    told = find_topics(
+        task, policy="matcher", reviser=wiw.policy("vlm", vlm="http://localhost:1/v1", key="SECRET", tracker="flow")
+    )
+    assert told["tracker"] == "flow (paper: sam2)" and told["policy"] == "matcher (paper: vlm, heuristic)"
+    assert "SECRET" not in str(told)
+    assert find_topics(task, policy=VLM("mock"))["tracker"] == "unknown (paper: sam2)"
+    pair = AgentRecipe(wiw.policy("vlm", vlm="mock", tries=8), "warp", wiw.policy("vlm", vlm="mock", view_size=99))
+    found = {each.short for each in find_departures(task, {"arm": pair})}
+    assert {"tries 8 (paper: open)", "view_size 99 (paper: 384)"} <= found
+
+
+def test_a_model_that_is_an_object_departs_by_its_options(own_preset: Path) -> None:
+    task = ImageNav("apartments:val", preset=own_preset)
+    found = find_topics(task, policy="matcher", model=wiw.world_model("warp", size=(144, 256)))
+    assert found["warp size"] == "(144, 256) (preset: [72, 128])"
+    assert "warp size" not in find_topics(task, policy="matcher", model=Warp(size=(72, 128)))
+
+
+def test_what_a_part_was_made_with_is_kept_as_long_as_the_part() -> None:
+    policy = wiw.policy("matcher", gate=0.1)
+    assert find_options(policy) == ("matcher", {"gate": 0.1}) and find_options(Matcher()) is None
+    place = id(policy)
+    del policy
+    assert place not in wiw.registry._MADE
 
 
 # -- where it is said --------------------------------------------------------------------------------------------------

@@ -343,3 +343,10 @@ def test_figures_of_runs_of_like_names_are_all_kept(tmp_path: Path, monkeypatch:
     study_page.write_study(None, parts, "{}", tmp_path)
     drawn = sorted(each.read_text() for each in tmp_path.glob("*.svg"))
     assert drawn == ["Near@1", "near:1", "near@1"]
+
+
+def test_an_arm_that_a_study_has_twice_is_refused(tmp_path: Path) -> None:
+    file = tmp_path / "own.yaml"
+    file.write_text("runs:\n  here:\n    arms:\n      long: {horizon: 10}\n      long: {horizon: 5}\n")
+    with pytest.raises(FileError, match=r"own.yaml.*key 'long' twice in one mapping, in lines 4 and 5"):
+        load_study(file)

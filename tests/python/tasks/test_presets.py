@@ -96,11 +96,42 @@ def test_a_file_of_ones_own_starts_from_a_shipped_preset(tmp_path: Path) -> None
         ("a: [", FileError, "own.yaml"),
         (r'a: "\Ud80088888888888888"', FileError, "expected characters of Unicode"),
         ("a: 2026-13-40", FileError, "own.yaml.*month"),
+        ("decisions: 10\nradius: 1\ndecisions: 11", FileError, r"own.yaml.*key 'decisions' twice .* lines 1 and 3"),
+        ("policies: {matcher: {gate: 1, gate: 2}}", FileError, "own.yaml.*key 'gate' twice"),
+        (
+            "policies: {matchr: {gate: 1}}",
+            ArgumentError,
+            r"own.yaml: policies: no policy is named 'matchr'; expected path.py:Class or .*Did you mean matcher\?",
+        ),
+        (
+            "models: {wrp: {size: [144, 256]}}",
+            ArgumentError,
+            "own.yaml: models: no world model is named 'wrp'; .*Did you mean warp",
+        ),
     ],
 )
 def test_what_is_wrong_in_a_file_is_named(tmp_path: Path, text: str, error: type, message: str) -> None:
     with pytest.raises(error, match=message):
         ImageNav(preset=write_preset(tmp_path, text))
+
+
+def test_keys_of_other_mappings_may_be_overridden_but_none_may_be_given_twice() -> None:
+    shared = "a: &a {x: 1, y: 2}\nb: {<<: *a, x: 3}\nc: {<<: [{x: 5}, *a], y: 4}\n"
+    assert parse_yaml(shared) == {"a": {"x": 1, "y": 2}, "b": {"x": 3, "y": 2}, "c": {"x": 5, "y": 4}}
+    assert parse_yaml("1: a\n'1': b") == {1: "a", "1": "b"}
+    for text in ("x: {a: 1,\n a: 2}", "1: a\n0x1: b", "<<: {b: 1}\na: 1\na: 2"):
+        with pytest.raises(ValueError, match=r"key '\w+' twice in one mapping, in lines \d and \d; leave one out"):
+            parse_yaml(text)
+
+
+def test_a_preset_has_options_of_a_class_in_a_file_beside_it(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    own = write_preset(tmp_path, "models: {'mine.py:Mine': {n: 7}}\npolicies: {'isolated:mine.py:Plans': {m: 1}}")
+    task = ImageNav(preset=own)
+    for folder, name in ((tmp_path.parent, f"{tmp_path / 'mine.py'}:Mine"), (tmp_path, "mine.py:Mine")):
+        monkeypatch.chdir(folder)
+        assert AgentRecipe("matcher", name).resolve_model_options(task) == {"n": 7}
+    recipe = AgentRecipe("isolated:mine.py:Plans")
+    assert recipe.resolve_policy_options(recipe.policy, task) == {"m": 1}
 
 
 def test_a_preset_that_is_not_there_is_named(tmp_path: Path) -> None:
