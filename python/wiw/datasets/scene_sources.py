@@ -1,8 +1,9 @@
 # SPDX-License-Identifier: Apache-2.0
 """Which files a scene's pictures and paths come from, without opening it, and a digest of what is in them.
 
-The scene, its navigation mesh, and the materials, textures and models that its files name, and those name in turn. Not
-followed: what a Habitat scene dataset places by the names of templates, which only opening the scene finds.
+The scene, its navigation mesh, the files that label a scan, and the materials, textures and models that these files
+name, and those name in turn. Not followed: what a Habitat scene dataset places by the names of templates, which only
+opening the scene finds.
 """
 
 from __future__ import annotations
@@ -16,12 +17,13 @@ from urllib.parse import unquote
 from wiw.datasets.worlds import navmesh_file
 from wiw.errors import Error
 from wiw.scenes import is_generated
+from wiw.scenes.scans import replica
 
 _URI = re.compile(rb'"uri"\s*:\s*"(?!data:)([^"]+)"')
 _ELEMENT = re.compile(rb"<(?:uri|init_from|ref)>\s*([^<]+?)\s*</")
 _NAMES = {
-    ".obj": re.compile(rb"^[ \t]*mtllib[ \t]+(.+?)[ \t\r]*$", re.MULTILINE),
-    ".mtl": re.compile(rb"^[ \t]*(?:map_\w+|bump|disp|decal|norm|refl)[ \t]+(.+?)[ \t\r]*$", re.MULTILINE | re.I),
+    ".obj": re.compile(rb"\n[ \t]*mtllib[ \t]+(.+?)[ \t]*$", re.MULTILINE),
+    ".mtl": re.compile(rb"\n[ \t]*(?:map_\w+|bump|disp|decal|norm|refl)[ \t]+(.+?)[ \t]*$", re.MULTILINE | re.I),
     ".ply": re.compile(rb"^comment TextureFile[ \t]+(.+?)[ \t\r]*$", re.MULTILINE),
     ".gltf": _URI,
     ".glb": _URI,
@@ -30,6 +32,8 @@ _NAMES = {
     ".world": _ELEMENT,
 }
 """How files of each kind name others."""
+_LINE_ENDS = bytes.maketrans(b"\r\f\0", b"\n\n\n")
+"""What ends a line of a Wavefront file besides a line feed."""
 _SCHEME = re.compile(r"^[a-z]+://")
 _TEXTURES = ("", "textures", "../textures", "materials/textures", "../materials/textures")
 """Folders, seen from a file's own, where a texture that is not at its path is looked for by its name alone."""
@@ -73,7 +77,7 @@ def _list_sources(path: Path) -> list[Path | None]:
     is_world = path.suffix.lower() in (".sdf", ".world")
     models = (folder.parent / "models", folder / "models", folder, folder.parent) if is_world else ()
     found: list[Path | None] = [_find_navmesh(path)]
-    waiting: list[Path | None] = [path]
+    waiting: list[Path | None] = [path, *_find_labels(path)]
     while waiting:
         file = waiting.pop(0)
         if file is None or file not in found:
@@ -89,21 +93,43 @@ def _find_navmesh(path: Path) -> Path | None:
         return None
 
 
+def _find_labels(path: Path) -> list[Path]:
+    """Return the files beside a scan that label it, in the layouts of docs/real-scans.md."""
+    names = []
+    if path.suffix.lower() in (".glb", ".obj"):
+        names = [f"{path.stem}.house", f"{path.stem}_semantic.ply"]
+    if path.suffix == ".glb":
+        scan = path.stem.removesuffix(".basis")
+        names += [f"{scan}.semantic.glb", f"{scan}.semantic.txt"]
+    if path.name == replica.MESH:
+        names = [replica.TABLE]
+    return [file for name in names if (file := path.with_name(name)).is_file()]
+
+
 def _list_named(file: Path, models: Sequence[Path]) -> Iterator[Path | None]:
     """Yield the files that a file names, in order."""
     pattern = _NAMES.get(file.suffix.lower())
     if pattern is None:
         return
     try:
-        content = file.read_bytes()
+        content = _read_naming_part(file)
     except OSError:
         return
-    if file.suffix.lower() == ".glb":  # the JSON of a binary glTF is its first chunk
-        content = content[20 : 20 + int.from_bytes(content[12:16], "little")]
-    elif file.suffix.lower() == ".ply":
-        content = content[:_PLY_HEADER]
     for match in pattern.finditer(content):
         yield from _find_named(match[1].decode(errors="surrogateescape"), file.parent, models)
+
+
+def _read_naming_part(file: Path) -> bytes:
+    """Return what of a file may name others; of a Wavefront file with a line feed before each line."""
+    kind = file.suffix.lower()
+    with file.open("rb") as stream:
+        if kind == ".glb":  # the JSON of a binary glTF is its first chunk
+            length = int.from_bytes(stream.read(20)[12:16], "little")
+            return stream.read(min(length, file.stat().st_size))
+        if kind == ".ply":
+            return stream.read(_PLY_HEADER)
+        content = stream.read()
+    return b"\n" + content.translate(_LINE_ENDS) if kind in (".obj", ".mtl") else content
 
 
 def _find_named(name: str, folder: Path, models: Sequence[Path]) -> list[Path | None]:
@@ -122,8 +148,8 @@ def _find_named(name: str, folder: Path, models: Sequence[Path]) -> list[Path | 
 
 
 def _locate(name: str, folder: Path, models: Sequence[Path]) -> Path | None:
-    """Return the first place where a name leads to something; None if none does."""
-    if not Path(name).name:
+    """Return the first place where a name leads to a file or a folder; None if none does, as for a device or ".."."""
+    if Path(name).name in ("", ".."):
         return None
     places = [
         folder / name,
@@ -131,7 +157,7 @@ def _locate(name: str, folder: Path, models: Sequence[Path]) -> Path | None:
         *(each / name for each in models),
     ]
     try:
-        return next((place for place in places if place.exists()), None)
+        return next((place for place in places if place.is_file() or place.is_dir()), None)
     except (OSError, ValueError):  # no path, such as one with a null byte
         return None
 

@@ -236,12 +236,12 @@ class RunStore:
         configurations.require_same(self.path, self.config["task"], json.loads(to_json(task)))
 
     def require_same(self, begun_with: dict[str, Any], now: dict[str, Any]) -> None:
-        """Check a mapping against the one that the run was started with.
+        """Check settings or scenes, by name, against those that the run was started with.
 
         Raises:
-            StoreError: it differs; says in what.
+            StoreError: they differ; says in what. The "content" of a scene differs only where both have one.
         """
-        configurations.require_same(self.path, begun_with, now)
+        configurations.require_same_inputs(self.path, begun_with, now)
 
     @classmethod
     def read(cls, run: str | Path) -> RunStore:

@@ -86,7 +86,7 @@ def verify(run: str | Path | Run, episodes: int = 3, seed: int = 0) -> Verificat
     Raises:
         ArgumentError: fewer than one episode.
         StoreError: the run cannot be read, is of another version of the benchmark, was started with objects in memory,
-            has no finished episode, or its task or source files have changed.
+            has no finished episode, or its task, scenes or source files have changed.
         FileError: a scene does not exist.
     """
     if episodes < 1:

@@ -70,7 +70,7 @@ def blame(
             progress is, or an agent that cannot use the ground truth, such as one without a reviser, or one that
             answers questions with another policy than `explorer`; or overrides if nothing is left to rerun.
         StoreError: the run cannot be read, was started with objects in memory or by another version, or its task,
-            agents or navigation meshes have changed.
+            agents, scenes or navigation meshes have changed.
         FileError: a scene does not exist.
     """
     for name, value in (("episodes", episodes), ("workers", workers)):

@@ -154,7 +154,8 @@ class Task(ABC):
         """Check that everything episodes need exists, without loading it.
 
         Returns:
-            For each scene, what it is used with, which must not change during a run.
+            For each scene, what it is used with, which must not change during a run. A digest of what is in its files
+            is its "content", which is compared only where both sides have one.
 
         Raises:
             FileError: something is missing.

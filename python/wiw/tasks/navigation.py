@@ -12,6 +12,7 @@ from typing import Any, Literal
 import numpy as np
 
 from wiw.datasets import episodes as episode_file
+from wiw.datasets.scene_sources import digest_scenes
 from wiw.datasets.worlds import World, navmesh_file, world
 from wiw.envs.episode_state import NavigationSpec
 from wiw.envs.navigation import NavigationEnv
@@ -253,10 +254,11 @@ class NavigationTask(NavigationSpec, Task):
         return self._episodes
 
     def require(self, episodes: Iterable[Episode]) -> dict[str, dict[str, str]]:
-        """Check that the scenes of episodes are there, without loading any.
+        """Check that the scenes of episodes are there, without loading any; each file is read once for its digest.
 
         Returns:
-            For each scene, what it is used with: its "navmesh", a file or "built".
+            For each scene, what it is used with: its "navmesh", a file or "built"; and of a scene that is a file the
+            digest of its "content" (`wiw.datasets.scene_sources`).
 
         Raises:
             FileError: one is not; names it, and the episode file.
@@ -272,6 +274,8 @@ class NavigationTask(NavigationSpec, Task):
                 where = f"{self.episode_file}: episode {episode.episode_id}: scene: " if self.episode_file else ""
                 raise FileError(f"{where}{error}") from error
             used[scene] = {"navmesh": str(navmesh_file(scene) or "built")}
+        for scene, digest in digest_scenes({scene: scene for scene in used}).items():
+            used[scene]["content"] = digest
         return used
 
     def episode(self, index: int) -> Episode:

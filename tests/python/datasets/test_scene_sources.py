@@ -4,6 +4,7 @@
 from __future__ import annotations
 
 import json
+import os
 import shutil
 import struct
 from collections.abc import Mapping
@@ -28,11 +29,29 @@ SCENES: Mapping[str, Mapping[str, bytes]] = {
         "house.navmesh": b"3",
     },
     "several.obj": {"several.obj": b"mtllib a.mtl b.mtl\n", "a.mtl": b"", "b.mtl": b"map_Kd b.png\n", "b.png": b"1"},
+    "old mac.obj": {
+        "old mac.obj": b"# one\rmtllib a.mtl\rv 0 0 0\r",
+        "a.mtl": b"newmtl a\rmap_Kd wall.png\rmap_Bump bump.png\r",
+        "wall.png": b"1",
+        "bump.png": b"2",
+    },
     "house.gltf": {
         "house.gltf": json.dumps({"buffers": [{"uri": "a%20b.bin"}, {"uri": "data:,x"}]}).encode(),
         "a b.bin": b"1",
     },
     "house.glb": {"house.glb": write_glb({"images": [{"uri": "wall.png"}]}), "wall.png": b"1"},
+    "mp3d/scan.obj": {"mp3d/scan.obj": b"v 0 0 0\n", "mp3d/scan.house": b"1", "mp3d/scan_semantic.ply": b"2"},
+    "hm3d/scan.basis.glb": {
+        "hm3d/scan.basis.glb": write_glb({}),
+        "hm3d/scan.basis.navmesh": b"1",
+        "hm3d/scan.semantic.glb": write_glb({"images": [{"uri": "labels.png"}]}),
+        "hm3d/scan.semantic.txt": b"2",
+        "hm3d/labels.png": b"3",
+    },
+    "replica/mesh_semantic.ply": {
+        "replica/mesh_semantic.ply": b"ply\nend_header\n",
+        "replica/info_semantic.json": b"{}",
+    },
     "house.ply": {"house.ply": b"ply\ncomment TextureFile wall.png\nend_header\n", "wall.png": b"1"},
     "house.dae": {"house.dae": b"<image><init_from> file://wall.png </init_from></image>", "wall.png": b"1"},
     "worlds/a.world": {
@@ -74,6 +93,17 @@ def test_a_digest_depends_on_nothing_else(scene: str, tmp_path: Path, monkeypatc
     assert digest_scene(tmp_path / "there/more" / scene) == found
     monkeypatch.chdir(tmp_path / "there/more")
     assert digest_scene(Path(scene)) == found
+
+
+def test_what_a_scene_names_besides_files_and_models_is_not_read(tmp_path: Path) -> None:
+    """A device may never end, and the folder above may be a whole disk."""
+    write_files(tmp_path, {"here/house.obj": b"mtllib /dev/zero\nmtllib ..\n", "there/house.obj": b""})
+    os.mkfifo(tmp_path / "here/pipe.mtl")
+    with (tmp_path / "here/house.obj").open("ab") as file:
+        file.write(b"mtllib pipe.mtl\n")
+    found = digest_scene(tmp_path / "here/house.obj")
+    write_files(tmp_path, {"there/house.obj": b"v 0 0 0\n"})
+    assert digest_scene(tmp_path / "here/house.obj") == found
 
 
 def test_only_files_have_digests_whatever_they_hold(tmp_path: Path) -> None:
