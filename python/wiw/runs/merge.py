@@ -260,9 +260,17 @@ def _read_manifest(store: RunStore) -> dict[str, Any]:
     episodes = [{**asdict(episode), "geodesic": None} for episode in store.episodes()]  # may be measured in one alone
     own = drop_folders({"task": store.config["task"], "episode": episodes})  # data may lie elsewhere on another machine
     limits = {name: info["limits"].get(name) for name in ("fidelity", "fidelity_share", "lpips")}
-    kept = {name: info.get(name) for name in ("sources", "scenes", "until")}
+    files = {name: _by_file_name(info.get(name) or {}) for name in ("sources", "scenes")}
     versions = {"wiw": store.wiw_version, "benchmark": store.benchmark}
-    return {**versions, **store.config, "salt": store.salt, **limits, **kept, **own}
+    return {**versions, **store.config, "salt": store.salt, **limits, **files, "until": info.get("until"), **own}
+
+
+def _by_file_name(facts: Mapping[str, Any]) -> dict[str, Any]:
+    """Return what is known of files by their names alone, in the order of their paths where several share one."""
+    found: dict[str, list[Any]] = {}
+    for path, known in facts.items():
+        found.setdefault(drop_folders(path), []).append(drop_folders(known))
+    return {name: known[0] if len(known) == 1 else known for name, known in found.items()}
 
 
 def _compare(first: Any, second: Any, place: str) -> Iterator[tuple[str, Any, Any]]:

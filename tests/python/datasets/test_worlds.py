@@ -130,11 +130,16 @@ def test_a_run_without_digests_is_read_and_resumed(house: Path, tmp_path: Path) 
 
 
 def test_shards_are_merged_that_had_the_same_scene(house: Path, tmp_path: Path) -> None:
+    elsewhere = tmp_path / "elsewhere"
+    elsewhere.mkdir()
+    _, copy = (Path(shutil.copy(house.with_name(name), elsewhere)) for name in ("two_rooms.mtl", "house.obj"))
     for number, more in ((1, ""), (2, ""), (3, "# one more line\n")):
         write_again(house, more)
         begin(house, tmp_path / str(number), shard=f"{min(number, 2)}/2", salt="s")
+    begin(copy, tmp_path / "4", shard="2/2", salt="s")
     assert wiw.merge([tmp_path / "1", tmp_path / "2"], tmp_path / "merged").complete
-    with pytest.raises(StoreError, match=r"scenes\.\S+/house\.obj\.content: "):
+    assert wiw.merge([tmp_path / "1", tmp_path / "4"], tmp_path / "of two places").complete
+    with pytest.raises(StoreError, match=r"scenes\.house\.obj\.content: "):
         wiw.merge([tmp_path / "1", tmp_path / "3"], tmp_path / "other")
     assert not (tmp_path / "other").exists()
     forget_an_episode(tmp_path / "merged")
