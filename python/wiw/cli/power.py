@@ -115,8 +115,8 @@ def _print_tasks(plans: Mapping[str, Callable[[], Power]], chance: float) -> Non
     if not found:
         raise next(iter(refused.values()))
     _print_table([*found.values()], chance, [*found])
-    for task, error in refused.items():
-        print(f"{task}: {error}")
+    for task, why in refused.items():
+        print(f"{task}: {why}")
 
 
 def _find_pilots(task: str | None, run: Path | None, arms: str | None) -> dict[str, Pilot]:
