@@ -148,16 +148,20 @@ def _find_named(name: str, folder: Path, models: Sequence[Path]) -> list[Path | 
 
 
 def _locate(name: str, folder: Path, models: Sequence[Path]) -> Path | None:
-    """Return the first place where a name leads to a file or a folder; None if none does, as for a device or ".."."""
+    """Return the first place where a name leads to a file, or to a model's folder; None if none does, as for a device.
+
+    A folder is read whole: only where worlds look for models is one taken, and none that lies above or elsewhere.
+    """
     if Path(name).name in ("", ".."):
         return None
+    may_be_folder = bool(models) and not Path(name).is_absolute() and ".." not in Path(name).parts
     places = [
         folder / name,
         *(folder / each / Path(name).name for each in _TEXTURES),
         *(each / name for each in models),
     ]
     try:
-        return next((place for place in places if place.is_file() or place.is_dir()), None)
+        return next((place for place in places if place.is_file() or (may_be_folder and place.is_dir())), None)
     except (OSError, ValueError):  # no path, such as one with a null byte
         return None
 

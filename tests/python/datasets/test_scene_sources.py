@@ -104,6 +104,13 @@ def test_what_a_scene_names_besides_files_and_models_is_not_read(tmp_path: Path)
     found = digest_scene(tmp_path / "here/house.obj")
     write_files(tmp_path, {"there/house.obj": b"v 0 0 0\n"})
     assert digest_scene(tmp_path / "here/house.obj") == found
+    there = f"<uri>{tmp_path / 'there'}</uri><uri>../there</uri>".encode()
+    write_files(tmp_path, {"here/in.world": b"<uri>model://box</uri>" + there, "here/box/model.sdf": b""})
+    found = digest_scene(tmp_path / "here/in.world")
+    write_files(tmp_path, {"there/house.obj": b""})
+    assert digest_scene(tmp_path / "here/in.world") == found
+    write_files(tmp_path, {"here/box/model.sdf": b"<sdf/>"})
+    assert digest_scene(tmp_path / "here/in.world") != found
 
 
 def test_only_files_have_digests_whatever_they_hold(tmp_path: Path) -> None:
