@@ -325,9 +325,10 @@ class AgentRecipe(AgentConfig):
         """
         given = {"tracker": self.tracker, "tracker_options": dict(self.tracker_options)}
         tracker = {name: value for name, value in given.items() if value}
-        if not tracker:
-            return self._make_policy(self.policy, space, task), self._make_policy(self.reviser, space, task)
         revising = self._find_reviser(task)
+        if not tracker:
+            reviser = revising if self._has_own_options(revising, task) else self.reviser
+            return self._make_policy(self.policy, space, task), self._make_policy(reviser, space, task)
         if not isinstance(revising, str) or "tracker" not in inspect.signature(POLICIES.find(revising)).parameters:
             raise ArgumentError(
                 f"tracker: policy {revising if isinstance(revising, str) else type(revising).__name__} does not use "
@@ -346,6 +347,12 @@ class AgentRecipe(AgentConfig):
         if isinstance(kind, type) and issubclass(kind, Policy) and kind.score is Policy.score:
             return task.defaults.get("revision") or kind.default_revision
         return self.policy
+
+    def _has_own_options(self, reviser: Any, task: Task) -> bool:
+        """Return whether a reviser that nobody has named has options, so that it cannot be made by its bare name."""
+        revises = self.model is not None or bool(task.defaults.get("revision"))
+        is_default = self.reviser is None and reviser is not self.policy and isinstance(reviser, str)
+        return is_default and revises and bool(self.resolve_policy_options(reviser, task))
 
     def _make_policy(self, policy: Any, space: str, task: Task, more: Mapping[str, Any] = NOTHING) -> Any:
         """Return a policy with the options of its name, the task's and more; others are made with the agent."""

@@ -36,21 +36,28 @@ def cluster(tmp_path, monkeypatch):
         made.shutdown()
 
 
-def test_a_lost_node_takes_its_actor_and_its_server_with_it_and_nothing_else(cluster, tmp_path, monkeypatch):
-    run_walk(tmp_path / "here").close()
-    removed, note = [], ray_servers.ServerPool.note_progress
+def remove_a_node_once(cluster, monkeypatch, is_replaced):
+    """Remove the node of the first server when an episode has ended; return the list that then has all their nodes."""
+    served, note = [], ray_servers.ServerPool.note_progress
 
     def remove_once(pool):
         note(pool)
-        if not removed and len(pool):
-            removed.append([server.node for server in pool._servers])
-            (lost,) = [node for node in cluster.workers if node.node_id == pool._servers[0].node]
+        if not served and len(pool):
+            served.extend(server.node for server in pool._servers)
+            (lost,) = [node for node in cluster.workers if node.node_id == served[0]]
             cluster.remove_node(lost)
-            cluster.add_node(num_cpus=1, num_gpus=1, object_store_memory=10**8)
+            if is_replaced:
+                cluster.add_node(num_cpus=1, num_gpus=1, object_store_memory=10**8)
 
     monkeypatch.setattr(ray_servers.ServerPool, "note_progress", remove_once)
+    return served
+
+
+def test_a_lost_node_takes_its_actor_and_its_server_with_it_and_nothing_else(cluster, tmp_path, monkeypatch):
+    run_walk(tmp_path / "here").close()
+    served = remove_a_node_once(cluster, monkeypatch, is_replaced=True)
     run_walk(tmp_path / "run", engine="ray", workers=2, live=2, servers=2, server_gpus=1).close()
-    assert len(set(removed[0])) == 2, "a server on each node, for each has one GPU"
+    assert len({*served}) == 2, "a server on each node, for each has one GPU"
     assert list_facts(tmp_path / "run") == list_facts(tmp_path / "here")
 
 
@@ -59,16 +66,7 @@ def test_a_lost_node_that_nothing_replaces_ends_no_run(cluster, tmp_path, monkey
     monkeypatch.setattr(ray_engine, "SERVER_SECONDS", 60.0)
     monkeypatch.setattr(ray_engine, "PLACE_SECONDS", 30.0)
     run_walk(tmp_path / "here").close()
-    removed, note = [], ray_servers.ServerPool.note_progress
-
-    def remove_once(pool):
-        note(pool)
-        if not removed and len(pool):
-            removed.append([server.node for server in pool._servers])
-            (lost,) = [node for node in cluster.workers if node.node_id == pool._servers[0].node]
-            cluster.remove_node(lost)
-
-    monkeypatch.setattr(ray_servers.ServerPool, "note_progress", remove_once)
+    served = remove_a_node_once(cluster, monkeypatch, is_replaced=False)
     run_walk(tmp_path / "run", engine="ray", workers=2, live=2, servers=2, server_gpus=1).close()
-    assert len(set(removed[0])) == 2
+    assert len({*served}) == 2
     assert list_facts(tmp_path / "run") == list_facts(tmp_path / "here")

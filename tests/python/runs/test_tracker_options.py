@@ -61,6 +61,12 @@ def test_the_policy_that_revises_has_the_tracker(recipe: AgentRecipe, name: str,
     assert recipe.is_named is not isinstance(recipe.tracker, Reprojection)
 
 
+def test_a_reviser_that_nobody_names_has_the_options_of_the_preset(tmp_path: Path, two_rooms: str) -> None:
+    context = RunContext(AR(episode_file=a_file(tmp_path, two_rooms), preset="foresight"))
+    for policy in ("heuristic", "recogniser"):
+        assert describe_tracker(AgentRecipe(policy, "copy"), context)["name"] == "Growing"
+
+
 def test_options_alone_are_those_of_the_policys_own_tracker(weights: Path, context: RunContext) -> None:
     recipe = AgentRecipe("vlm", "copy", tracker_options={"weights": str(weights)}, **VLM)
     assert describe_tracker(recipe, context)["name"] == "Sam2"
