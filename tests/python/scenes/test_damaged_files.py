@@ -158,6 +158,7 @@ def test_a_texture_named_in_latin_1_is_found_by_its_name_in_utf_8(tmp_path: Path
         (b"#\f" + OBJ, b"map_Kd a\n", "m.mtl: line 1 has 'map_Kd'"),
         (OBJ.replace(b"mtllib ", b"mtllib \\\n"), b"map_Kd a\n", "m.mtl: line 1 has 'map_Kd'"),
         (b"mtllib m.obj\rmap_Kd a\n" + OBJ, MTL, "m.obj: line 1 has 'mtllib'"),
+        (b"mtllib x file://\n" + OBJ, MTL, "expected the name of a file beside it, not an address"),
     ],
 )
 def test_a_texture_of_no_material_is_found_however_lines_end(

@@ -72,6 +72,7 @@ std::vector<std::uint8_t> GuardedIo::read_obj(const char* file) const {
   unify_line_ends(file, bytes);
   if (open_ == 0) {
     join_continued_lines(bytes);
+    check_library_names(file, bytes);
   } else {  // what is read while the OBJ is read are its materials, be it the same file
     check_obj_materials(file, bytes);
   }

@@ -47,6 +47,19 @@ void join_continued_lines(std::vector<std::uint8_t>& bytes) {
   }
 }
 
+void check_library_names(const fs::path& path, std::span<const std::uint8_t> bytes) {
+  std::string_view text = as_text(bytes);
+  for (std::size_t number = 1; !text.empty(); ++number) {
+    const std::size_t end = std::min(text.find('\n'), text.size());
+    const std::string_view line = text.substr(0, end);
+    if (line.starts_with("mtllib") && line.find("://") != std::string_view::npos) {
+      throw FileError(path.string(), "line " + std::to_string(number) + " has '" + std::string(line.substr(0, 80)) +
+                                         "'; expected the name of a file beside it, not an address");
+    }
+    text.remove_prefix(std::min(end + 1, text.size()));
+  }
+}
+
 void check_obj_materials(const fs::path& path, std::span<const std::uint8_t> bytes) {
   std::string_view text = as_text(bytes);
   for (std::size_t number = 1; !text.empty(); ++number) {
