@@ -216,7 +216,7 @@ class Registry:
 
 
 _MADE: dict[int, tuple[weakref.ref[Any], str, dict[str, Any]]] = {}
-"""What registries have made and is still in use, by identity: its name, empty for a class, and its options."""
+"""Parts that registries have made and that are still in use, by identity: name, empty for a class, and options."""
 
 
 def find_options(part: Any) -> tuple[str, Mapping[str, Any]] | None:

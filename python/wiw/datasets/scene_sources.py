@@ -33,7 +33,7 @@ _NAMES = {
 }
 """How files of each kind name others."""
 _LINE_ENDS = bytes.maketrans(b"\r\f\0", b"\n\n\n")
-"""What ends a line of a Wavefront file besides a line feed."""
+"""Makes line feeds of the other characters that end a line of a Wavefront file."""
 _SCHEME = re.compile(r"^[a-z]+://")
 _TEXTURES = ("", "textures", "../textures", "materials/textures", "../materials/textures")
 """Folders, seen from a file's own, where a texture that is not at its path is looked for by its name alone."""
