@@ -16,6 +16,17 @@ std::string_view as_text(std::span<const std::uint8_t> bytes) {
   return {reinterpret_cast<const char*>(bytes.data()), bytes.size()};
 }
 
+/// Calls `visit` with the number of each line, from 1, and the line, as long as it returns true.
+template <class Visit>
+void visit_lines(std::span<const std::uint8_t> bytes, const Visit& visit) {
+  std::string_view text = as_text(bytes);
+  for (std::size_t number = 1; !text.empty(); ++number) {
+    const std::size_t end = std::min(text.find('\n'), text.size());
+    if (!visit(number, text.substr(0, end))) return;
+    text.remove_prefix(std::min(end + 1, text.size()));
+  }
+}
+
 /// Lines that assimp takes as a property of the material before them without a look whether there is one. It goes by
 /// the first letters.
 bool needs_material(std::string_view line) {
@@ -48,34 +59,28 @@ void join_continued_lines(std::vector<std::uint8_t>& bytes) {
 }
 
 void check_library_names(const fs::path& path, std::span<const std::uint8_t> bytes) {
-  std::string_view text = as_text(bytes);
-  for (std::size_t number = 1; !text.empty(); ++number) {
-    const std::size_t end = std::min(text.find('\n'), text.size());
-    const std::string_view line = text.substr(0, end);
+  visit_lines(bytes, [&](std::size_t number, std::string_view line) {
     if (line.starts_with("mtllib") && line.find("://") != std::string_view::npos) {
       throw FileError(path.string(), "line " + std::to_string(number) + " has '" + std::string(line.substr(0, 80)) +
                                          "'; expected the name of a file beside it, not an address");
     }
-    text.remove_prefix(std::min(end + 1, text.size()));
-  }
+    return true;
+  });
 }
 
 void check_obj_materials(const fs::path& path, std::span<const std::uint8_t> bytes) {
-  std::string_view text = as_text(bytes);
-  for (std::size_t number = 1; !text.empty(); ++number) {
-    const std::size_t end = std::min(text.find('\n'), text.size());
-    std::string_view line = text.substr(0, end);
+  visit_lines(bytes, [&](std::size_t number, std::string_view line) {
     // assimp passes over blanks at the beginning of every line but the first
     if (number > 1) line.remove_prefix(std::min(line.find_first_not_of(" \t"), line.size()));
-    if (line.starts_with("ne") || line.starts_with("Ne")) return;
+    if (line.starts_with("ne") || line.starts_with("Ne")) return false;
     if (needs_material(line)) {
       throw FileError(path.string(), "line " + std::to_string(number) + " has '" +
                                          std::string(line.substr(0, line.find_first_of(" \t"))) +
                                          "' before any 'newmtl'; expected it behind the name of its material "
                                          "(damaged file)");
     }
-    text.remove_prefix(std::min(end + 1, text.size()));
-  }
+    return true;
+  });
 }
 
 }  // namespace wiw::scene
